@@ -236,6 +236,7 @@ def test_answers_wait_for_a_network_that_fails_and_none_is_lost_or_stored_twice(
     assert len(answered(page, test)) == 3
 
 
+@pytest.mark.long
 def test_a_listener_at_loudspeakers_is_thanked_after_two_tries(page, duel):
     test, _ = duel
     begin(page)
@@ -282,6 +283,7 @@ def test_controls_are_named_and_texts_stand_out(page, duel):
     assert page.evaluate("document.scrollingElement.scrollWidth") <= 360
 
 
+@pytest.mark.long
 def test_levels_are_rated_with_the_keyboard(browser, tmp_path):
     design = design_of("rating", places=1, screening=False, trials=ratings(1))
     test = write_test(tmp_path / "rating", design)

@@ -80,6 +80,7 @@ def corridor():
     return scene.model_copy(update={"geometry": geometry, "probes": probes, "simulation": simulation})
 
 
+@pytest.mark.long
 def test_both_simulations_agree_where_nothing_scatters_and_where_everything_does(monkeypatch):
     """In between they mean different things by a coefficient, and a corridor tells them apart."""
     monkeypatch.setattr(reverberation, "_RUNS", 3)

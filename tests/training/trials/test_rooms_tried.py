@@ -24,7 +24,7 @@ def test_there_are_ten_rooms_of_extremes():
     assert max(absorptions) > 0.99
 
 
-@pytest.mark.parametrize("name", ["booth", "dry-box"])
+@pytest.mark.parametrize("name", ["booth", pytest.param("dry-box", marks=pytest.mark.long)])
 def test_what_is_off_is_not_heard(name):
     rows = list(compare(room(name), emitters=2, rays=3_000))
     assert {row.effect for row in rows} >= {SimulatedEffect.SCATTERING, SimulatedEffect.LATE_REVERBERATION}
