@@ -187,8 +187,9 @@ class AudioEngine:
             stream.deliver([StreamFailed()])
 
     def loads(self) -> dict[str, tuple[int, float]]:
-        """Number of streams of each thread, by name, and the share of the last period in which it rendered."""
-        counts = Counter(self._thread_of.values())
+        """Number of streams of each thread, by name, and the share of the last period in which it rendered. Any thread
+        may call this."""
+        counts = Counter(tuple(self._thread_of.values()))
         return {thread.name: (counts[thread], thread.busy or 0.0) for thread in tuple(self.threads)}
 
     def _loads(self) -> dict["AudioThread", dict[Stream, float]]:
