@@ -19,6 +19,7 @@ import uvicorn
 
 from server.api.connection_limits import ConnectionLimits
 from server.api.http_protocol import limited_http
+from server.api.process_peers import ProcessPeers
 from server.api.settings import Settings
 from server.core.errors import NafirError
 from server.runtime.drain import Drain
@@ -79,6 +80,12 @@ def url(listener: socket.socket, host: str) -> str:
     return f"http://{shown}:{listener.getsockname()[1]}"
 
 
+def announcement(scenes: Sequence[str], url: str, *, peers: ProcessPeers | None = None) -> str:
+    """What is printed once a server accepts requests, with markup."""
+    processes = "" if peers is None else f" with {len(peers.ports)} processes"
+    return f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]{processes}"
+
+
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
     """Options with which uvicorn has to run the application."""
     return {
@@ -131,12 +138,10 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(
-    config: uvicorn.Config, listeners: Sequence[socket.socket], drain: Drain, on_start: Callable[[], None]
-) -> None:
+def serve(server: Server, listeners: Sequence[socket.socket]) -> None:
     """Serve until a signal. If a thread of the server cannot be stopped, for instance while it compiles, the process
     ends here with exit code 0."""
-    Server(config, drain, on_start=on_start).run(sockets=list(listeners))
+    server.run(sockets=list(listeners))
     if any(thread.name.startswith(_OWN_THREADS) for thread in threading.enumerate()):
         _end_process(0)
 

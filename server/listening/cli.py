@@ -140,7 +140,9 @@ def _serve(folder: Path, given: dict[str, str | int | None]) -> None:
     # The log of requests would hold addresses and codes together.
     config = uvicorn.Config(application, access_log=False, **serving.uvicorn_options(settings))
     try:
-        serving.serve(config, listeners, drain, on_start=lambda: Console().print(announcement, highlight=False))
+        serving.serve(
+            serving.Server(config, drain, on_start=lambda: Console().print(announcement, highlight=False)), listeners
+        )
     finally:
         for listener in listeners:
             listener.close()

@@ -186,6 +186,11 @@ class AudioEngine:
         for stream in self._streams_of(stuck):
             stream.deliver([StreamFailed()])
 
+    @property
+    def demand(self) -> float:
+        """How many cores the blocks of all streams take. It belongs to the event loop."""
+        return sum(sum(streams.values()) for streams in self._loads().values())
+
     def loads(self) -> dict[str, tuple[int, float]]:
         """Number of streams of each thread, by name, and the share of the last period in which it rendered. Any thread
         may call this."""
