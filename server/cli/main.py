@@ -95,23 +95,24 @@ def serve(
 
     Every setting can also come from the environment: NAFIR_HOST, NAFIR_PORT, NAFIR_BUNDLES, ...
     """
-    from server.api import serving
+    from server.api.listeners import bind, url_of
     from server.api.settings import checked_settings
-    from server.runtime.drain import Drain
-    from server.runtime.memory import give_back_large_arrays
 
     given = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf, "processes": processes}
     settings = checked_settings(given)
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
-        listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
-        url = serving.url(listeners[0], settings.host)
+        listeners = [opened.enter_context(listener) for listener in bind(settings.host, settings.port)]
+        url = url_of(listeners[0], settings.host)
         if settings.processes > 1:
             _serve_in_processes(settings, given, listeners, url)
         import uvicorn
         from rich.console import Console
 
+        from server.api import serving
         from server.api.start import loaded_app
+        from server.runtime.drain import Drain
+        from server.runtime.memory import give_back_large_arrays
 
         give_back_large_arrays()
         drain = Drain(settings.drain_s)

@@ -359,7 +359,7 @@ def test_a_port_in_use_ends_serve_at_once_before_anything_is_loaded_and_nothing_
 @pytest.mark.parametrize("option", ["clip", "hrtf"])
 def test_serve_looks_at_the_files_it_is_given_before_anything_else(nafir, monkeypatch, tmp_path, option):
     monkeypatch.setattr("server.api.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
-    monkeypatch.setattr("server.api.serving.bind", lambda *_: pytest.fail("a port is bound"))
+    monkeypatch.setattr("server.api.listeners.bind", lambda *_: pytest.fail("a port is bound"))
     check_error(nafir("serve", "--port", 0, f"--{option}", tmp_path / "missing.x"), f"{option}s", "missing.x")
 
 

@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from server.api.serving import bind, url
+from server.api.listeners import bind, url_of
 from server.core.errors import NafirError
 
 
@@ -17,7 +17,7 @@ def test_a_port_is_bound_and_answers_before_anything_is_loaded():
     (listener,) = listeners = bind("127.0.0.1", 0)
     try:
         host, port = listener.getsockname()
-        assert url(listener, host) == f"http://127.0.0.1:{port}"
+        assert url_of(listener, host) == f"http://127.0.0.1:{port}"
         assert port
         socket.create_connection((host, port), timeout=5).close()
     finally:
@@ -57,6 +57,6 @@ def test_an_address_of_ipv6_is_shown_as_urls_have_it():
     except NafirError:
         pytest.skip("no IPv6 on the loopback interface")
     try:
-        assert url(listeners[0], "::1") == f"http://[::1]:{listeners[0].getsockname()[1]}"
+        assert url_of(listeners[0], "::1") == f"http://[::1]:{listeners[0].getsockname()[1]}"
     finally:
         closed(listeners)
