@@ -131,7 +131,7 @@ class ProcessGroup:
         self._selector = selectors.DefaultSelector()
         self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
         self._has_announced = False
-        self._code = 0
+        self._exit_code = 0
         self._cut_off_s = math.inf
 
     def run(self) -> int:
@@ -159,7 +159,7 @@ class ProcessGroup:
             self._selector.close()
             for each in (waking, woken, *self._own):
                 each.close()
-        return self._code
+        return self._exit_code
 
     @property
     def _is_stopping(self) -> bool:
@@ -225,23 +225,25 @@ class ProcessGroup:
         member.channel.close()
         del self._members[member.number]
         try:
-            code = member.process.wait(_GRACE_S)
+            exit_code = member.process.wait(_GRACE_S)
         except subprocess.TimeoutExpired:  # it has closed its channel and goes on
             member.process.kill()
-            code = member.process.wait()
+            exit_code = member.process.wait()
         if self._is_stopping:
-            self._code = self._code or (max(0, code))
+            self._exit_code = self._exit_code or max(0, exit_code)
             return
-        if code == USER_ERROR:  # it has said why
+        if exit_code == USER_ERROR:  # it has said why
             self._stop(USER_ERROR)
             return
         now_s = time.monotonic()
         self._deaths.append(now_s)
         if len(self._deaths) == _MOST_DEATHS and now_s - self._deaths[0] < _DEATHS_WITHIN_S:
-            _logger.error("process %d has ended with code %d, as others before: the server ends", member.number, code)
+            _logger.error(
+                "process %d has ended with code %d, as others before: the server ends", member.number, exit_code
+            )
             self._stop(1)
             return
-        _logger.error("process %d has ended with code %d and is replaced", member.number, code)
+        _logger.error("process %d has ended with code %d and is replaced", member.number, exit_code)
         self._start(member.number)
 
     def _look(self) -> None:
@@ -249,7 +251,7 @@ class ProcessGroup:
         if self._is_stopping:
             if time.monotonic() > self._cut_off_s:
                 _logger.error("not all processes had ended: cut off")
-                self._code = self._code or 1
+                self._exit_code = self._exit_code or 1
                 self._kill()
         elif len(self._members) < len(self._shares) and any(member.is_ready for member in self._members.values()):
             for number in range(len(self._shares)):
@@ -261,14 +263,14 @@ class ProcessGroup:
             if number not in (signal.SIGTERM, signal.SIGINT):
                 continue
             if self._is_stopping:
-                self._code = 128 + number
+                self._exit_code = 128 + number
                 self._kill()
             else:
                 self._stop(0)
 
-    def _stop(self, code: int) -> None:
+    def _stop(self, exit_code: int) -> None:
         """Tell all processes to end in order."""
-        self._code = code
+        self._exit_code = exit_code
         self._cut_off_s = time.monotonic() + self._drain_s + _GRACE_S
         for member in self._members.values():
             member.process.send_signal(signal.SIGTERM)
