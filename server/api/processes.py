@@ -87,6 +87,8 @@ class Member:
     handed: int = 0
     """Connections handed to it since its last report."""
     reported_s: float = -math.inf
+    handed_s: float = -math.inf
+    """When the last connection was handed to it."""
     unread: bytearray = field(default_factory=bytearray)
 
     def read(self, data: bytes, now_s: float) -> None:
@@ -101,9 +103,10 @@ class Member:
 
 
 def least_loaded(members: Sequence[Member], now_s: float) -> list[Member]:
-    """The members to offer a connection to, best first: those that are ready, or all if none is."""
+    """The members to offer a connection to, best first: those that are ready, or all if none is. Of equal ones, the one
+    that has waited for longest comes first."""
     ready = [member for member in members if member.is_ready and now_s - member.reported_s < _STALE_S]
-    return sorted(ready or members, key=lambda member: member.load + member.handed * _PRESUMED_LOAD)
+    return sorted(ready or members, key=lambda member: (member.load + member.handed * _PRESUMED_LOAD, member.handed_s))
 
 
 class ProcessGroup:
@@ -201,10 +204,11 @@ class ProcessGroup:
 
     def _hand_over(self, connection: socket.socket) -> None:
         """Give a connection to a process. If none takes it, it is closed."""
-        for member in least_loaded(tuple(self._members.values()), time.monotonic()):
+        now_s = time.monotonic()
+        for member in least_loaded(tuple(self._members.values()), now_s):
             with contextlib.suppress(OSError):  # its channel is full, or it has just ended
                 socket.send_fds(member.channel, [b"\0"], [connection.fileno()])
-                member.handed += 1
+                member.handed, member.handed_s = member.handed + 1, now_s
                 return
 
     def _read(self, member: Member) -> None:

@@ -19,9 +19,11 @@ import uvicorn
 from server.api.connection_limits import ConnectionLimits
 from server.api.http_protocol import limited_http
 from server.api.process_peers import ProcessPeers
-from server.api.settings import Settings
+from server.api.settings import Settings, usable_cores
 from server.runtime.drain import Drain
 
+_CORES_OF_A_PROCESS = 2
+"""Cores that the streams of one process fill, about (`docs/results/processes.md`)."""
 _CUT_OFF_CODE = 1
 _CLOSING_SHARE = 0.05
 """Share of the drain time in which idle connections close."""
@@ -31,9 +33,16 @@ _logger = logging.getLogger(__name__)
 
 
 def announcement(scenes: Sequence[str], url: str, *, peers: ProcessPeers | None = None) -> str:
-    """What is printed once a server accepts requests, with markup."""
-    processes = "" if peers is None else f" with {len(peers.ports)} processes"
-    return f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]{processes}"
+    """What is printed once a server accepts requests, with markup. Where one process leaves most cores idle, it says
+    so."""
+    said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
+    if peers is not None:
+        return f"{said} with {len(peers.ports)} processes"
+    cores = usable_cores()
+    if cores < 2 * _CORES_OF_A_PROCESS:
+        return said
+    processes = cores // _CORES_OF_A_PROCESS
+    return f"{said}\nOne process fills about two of the {cores} cores: --processes {processes} uses them all"
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:

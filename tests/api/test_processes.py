@@ -19,6 +19,7 @@ from server.api.process_peers import merged
 from server.api.processes import Member, least_loaded, shares_of_cores
 from server.core.errors import NafirError
 
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot confine a process to cores")
 ROOT = Path(__file__).parents[2]
 
 MEMBER = textwrap.dedent("""
@@ -151,6 +152,16 @@ def test_a_connection_goes_to_the_least_loaded_that_is_ready_and_has_reported_la
     members[1].handed = 6
     assert [each.number for each in least_loaded(members, 1.0)] == [3, 1, 0]
     assert {each.number for each in least_loaded(members, 60.0)} == {0, 1, 2, 3}
+
+
+def test_processes_with_equal_loads_take_turns():
+    members = [member(number) for number in range(3)]
+    turns = []
+    for now_s in range(1, 7):
+        first, *_ = least_loaded(members, float(now_s))
+        first.handed_s = float(now_s)
+        turns.append(first.number)
+    assert turns == [0, 1, 2, 0, 1, 2]
 
 
 def test_reports_may_come_in_pieces_and_the_last_one_counts():

@@ -363,6 +363,13 @@ def test_serve_looks_at_the_files_it_is_given_before_anything_else(nafir, monkey
     check_error(nafir("serve", "--port", 0, f"--{option}", tmp_path / "missing.x"), f"{option}s", "missing.x")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot confine a process to cores")
+def test_more_processes_than_cores_are_refused_before_any_is_started(nafir, monkeypatch):
+    monkeypatch.setattr("server.api.processes.subprocess.Popen", lambda *_, **__: pytest.fail("a process is started"))
+    check_error(nafir("serve", "--port", 0, "--processes", 5_000), "processes", "5000", "cores")
+    check_error(nafir("serve", "--port", 0, "--processes", 0), "processes")
+
+
 @pytest.mark.parametrize("place", ["missing/out", "file/out", "."])
 @pytest.mark.parametrize("command", ["ir", "render", "plan", "check"])
 def test_what_cannot_be_written_is_refused_before_the_work(nafir, monkeypatch, tmp_path, command, place):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from server.streaming.balance import BalanceState, Move, ThreadLoad, balance
-from server.streaming.load_thresholds import THRESHOLDS
+from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 
 
 def after(threads, *, periods=THRESHOLDS.uneven_periods + 30, thresholds=THRESHOLDS):
@@ -82,6 +82,7 @@ class Cores:
     moves: list[tuple[float, str]] = field(default_factory=list)
     worst: list[float] = field(default_factory=list)
     state: BalanceState = field(default_factory=BalanceState)
+    thresholds: Thresholds = THRESHOLDS
     now_s: float = 0.0
 
     def __post_init__(self):
@@ -111,7 +112,7 @@ class Cores:
                 before = self._loads.get(name, 0.0)
                 # Half of the way in a period, as a stream's load is smoothed.
                 self._loads[name] = threads[thread].streams[name] = before + 0.5 * (load - before)
-            self.state, move = balance(THRESHOLDS, self.state, self.now_s, threads)
+            self.state, move = balance(self.thresholds, self.state, self.now_s, threads)
             if move is not None:
                 assert self.thread_of[move.key] == move.source
                 self.thread_of[move.key] = move.target
@@ -158,6 +159,19 @@ def test_threads_become_even_and_then_nothing_moves(name, first):
     cores.run(600.0)
     assert len(cores.moves) == settled
     assert settled <= len(works)
+
+
+@pytest.mark.parametrize("name", ["all on the first of two", "of every size", "a fast and a slow core"])
+def test_a_policy_that_moves_whatever_the_gain_has_streams_go_to_and_fro_for_ever(name):
+    speeds, works = CASES[name]
+    rash = replace(THRESHOLDS, least_gain=-0.1, uneven_periods=1, full_periods=1, load_known_s=0.0, stay_s=0.0)
+    cores = Cores(speeds, thresholds=rash)
+    for number, work in enumerate(works):
+        cores.open(str(number), work, on=0)
+    cores.run(90.0)
+    settled = len(cores.moves)
+    cores.run(600.0)
+    assert len(cores.moves) > settled + 20
 
 
 def test_streams_that_come_go_and_grow_stay_even_and_move_seldom():
