@@ -29,7 +29,7 @@ from typer.core import TyperCommand
 from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from uvicorn.server import ServerState
+from uvicorn.server import Server, ServerState
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -220,6 +220,12 @@ def test_uvicorns_web_socket_protocol_calls_what_ours_overrides() -> None:
     for name in ("handle_connect", "run_asgi", "handle_cont", "handle_ping", "send_receive_event_to_app"):
         relies(name in called, "uvicorn", WEB_SOCKET, f"{name} is called on the instance")
     relies("on_task_complete" in called, "uvicorn", WEB_SOCKET, "on_task_complete is called on the instance")
+
+
+def test_uvicorns_server_makes_protocols_as_ours_does_for_connections_that_others_accepted() -> None:
+    source = inspect.getsource(Server.startup)
+    for part in ("config.http_protocol_class(", "server_state=self.server_state", "app_state=self.lifespan.state"):
+        relies(part in source, "uvicorn", "server/api/member_server.py", f"protocols are made with {part}")
 
 
 def test_uvicorns_http_protocol_has_the_methods_that_ours_overrides_and_calls() -> None:

@@ -21,6 +21,7 @@ from server.api.first_start import CompilingProcess, tell_while_compiling
 from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
+from server.api.process_peers import ProcessPeers
 from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
 from server.api.settings import Settings, usable_cores
@@ -65,9 +66,11 @@ def create_app(
     hrtfs: HrtfLibrary | None = None,
     drain: Drain | None = None,
     compiler: CompilingProcess | None = None,
+    peers: ProcessPeers | None = None,
 ) -> FastAPI:
     """The application. A caller that wants to report loading errors first passes the loaded `scenes`, by id, and
-    `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already.
+    `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already. `peers`
+    are the processes of which this is one.
 
     Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError
     for a damaged HRTF file.
@@ -103,6 +106,7 @@ def create_app(
                 settings=settings,
                 responses=responses,
                 readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
+                peers=peers,
             )
             if settings.realtime:
                 become_prompt()

@@ -27,6 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
+from server.api.process_peers import ProcessPeers
 from server.api.response_cache import ResponseCache
 from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
@@ -105,6 +106,8 @@ class StreamHost:
     settings: Settings
     responses: ResponseCache
     readiness: Readiness
+    peers: ProcessPeers | None = None
+    """The processes that serve at one port, if this is one of them."""
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     ambisonic_offers: dict[tuple[str, int], Offer] = dataclasses.field(default_factory=dict)
     """The same for streams of ambisonics, by scene and order, once one was asked for."""

@@ -14,6 +14,7 @@ from server.api.asyncapi import document
 from server.api.catalogue import describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
+from server.api.process_peers import OWN_METRICS
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
@@ -93,6 +94,16 @@ async def readyz(request: Request) -> dict[str, str]:
 @health.get("/metrics", include_in_schema=False)
 async def metrics(request: Request) -> Response:
     """Metrics in Prometheus' text format."""
+    host = _host(request)
+    body = await anyio.to_thread.run_sync(exposition, ServerCollector(host))
+    if host.peers is not None:
+        body = await anyio.to_thread.run_sync(host.peers.gather, body)
+    return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+@health.get(OWN_METRICS, include_in_schema=False)
+async def own_metrics(request: Request) -> Response:
+    """Metrics of the process that answers; the other processes ask for them."""
     body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
     return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 

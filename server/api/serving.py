@@ -1,5 +1,4 @@
-"""The process of the web server. It binds its socket before it loads anything, prints its address once it serves, and
-shuts down within a stated time.
+"""The process of the web server. It prints its address once it serves, and shuts down within a stated time.
 
 uvicorn's own shutdown closes streams after 0.1 s without a message, and answers longer requests with 500.
 """
@@ -19,11 +18,12 @@ import uvicorn
 
 from server.api.connection_limits import ConnectionLimits
 from server.api.http_protocol import limited_http
-from server.api.settings import Settings
-from server.core.errors import NafirError
+from server.api.process_peers import ProcessPeers
+from server.api.settings import Settings, usable_cores
 from server.runtime.drain import Drain
 
-_BACKLOG = 2048
+_CORES_OF_A_PROCESS = 2
+"""Cores that the streams of one process fill, about (`docs/results/processes.md`)."""
 _CUT_OFF_CODE = 1
 _CLOSING_SHARE = 0.05
 """Share of the drain time in which idle connections close."""
@@ -32,51 +32,17 @@ _OWN_THREADS = "nafir-"
 _logger = logging.getLogger(__name__)
 
 
-def bind(host: str, port: int) -> list[socket.socket]:
-    """Listening sockets, one for each address of `host`. With `port` 0 all share one free port.
-
-    Connections wait until the server accepts them. Raises NafirError if an address cannot be bound.
-    """
-    try:
-        found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError) as exc:
-        raise NafirError(f"host: {host!r} is not an address of this machine ({exc}): give another with --host") from exc
-    listeners: list[socket.socket] = []
-    for family, _, _, _, address in dict.fromkeys(found):
-        chosen = listeners[0].getsockname()[1] if listeners else port
-        try:
-            listeners.append(_listening(family, (address[0], chosen, *address[2:])))
-        except OSError as exc:
-            for listener in listeners:
-                listener.close()
-            raise NafirError(_refusal(host, chosen, exc)) from exc
-    return listeners
-
-
-def _listening(family: int, address: tuple[object, ...]) -> socket.socket:
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        listener.bind(address)
-        # Two servers can bind the same port as long as neither listens.
-        listener.listen(_BACKLOG)
-    except OSError:
-        listener.close()
-        raise
-    return listener
-
-
-def _refusal(host: str, port: int, exc: OSError) -> str:
-    reason = exc.strerror or str(exc)
-    return f"port: cannot listen at {host}:{port} ({reason}): give another with --port, or 0 for one that is free"
-
-
-def url(listener: socket.socket, host: str) -> str:
-    """URL of a listening socket that was bound to `host`."""
-    shown = f"[{host}]" if ":" in host else host
-    return f"http://{shown}:{listener.getsockname()[1]}"
+def announcement(scenes: Sequence[str], url: str, *, peers: ProcessPeers | None = None) -> str:
+    """What is printed once a server accepts requests, with markup. Where one process leaves most cores idle, it says
+    so."""
+    said = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
+    if peers is not None:
+        return f"{said} with {len(peers.ports)} processes"
+    cores = usable_cores()
+    if cores < 2 * _CORES_OF_A_PROCESS:
+        return said
+    processes = cores // _CORES_OF_A_PROCESS
+    return f"{said}\nOne process fills about two of the {cores} cores: --processes {processes} uses them all"
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
@@ -131,12 +97,10 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(
-    config: uvicorn.Config, listeners: Sequence[socket.socket], drain: Drain, on_start: Callable[[], None]
-) -> None:
+def serve(server: Server, listeners: Sequence[socket.socket]) -> None:
     """Serve until a signal. If a thread of the server cannot be stopped, for instance while it compiles, the process
     ends here with exit code 0."""
-    Server(config, drain, on_start=on_start).run(sockets=list(listeners))
+    server.run(sockets=list(listeners))
     if any(thread.name.startswith(_OWN_THREADS) for thread in threading.enumerate()):
         _end_process(0)
 

@@ -20,8 +20,10 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from server.assets.names import named_by_stem
 from server.core.errors import NafirError
+from server.core.files import require_readable
 from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
+from server.runtime.open_files import allow_connections
 
 _PREFIX = "NAFIR_"
 _SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?")
@@ -86,6 +88,9 @@ class Settings(BaseSettings):
     hrtfs: NamedFiles = ()
     """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, besides KEMAR."""
 
+    processes: Annotated[int, Field(ge=1)] = 1
+    """Processes that serve at the port, each on an equal part of the cores. All other settings hold for each of
+    them."""
     audio_threads: Annotated[int, Field(ge=1)] = usable_cores()
     """Threads that render streams."""
     realtime: bool = True
@@ -171,3 +176,14 @@ def settings_of(given: Mapping[str, Any]) -> Settings:
         first = exc.errors()[0]
         place = f"setting {'.'.join(str(part) for part in first['loc'])}: " if first["loc"] else ""
         raise NafirError(f"{place}{first['msg'].removeprefix('Value error, ')}") from exc
+
+
+def checked_settings(given: Mapping[str, Any]) -> Settings:
+    """Settings from options of the command and the environment. Raises NafirError, also for a file that cannot be
+    read."""
+    settings = settings_of(given)
+    allow_connections(settings.max_connections)
+    for name in ("clips", "hrtfs"):
+        for path in getattr(settings, name):
+            require_readable(path, name)
+    return settings

@@ -85,9 +85,28 @@ class ServerCollector(Collector):
             "Blocks of a stream that the busiest audio thread renders at once; more under load.",
             value=max(thread.blocks_at_once for thread in self._host.audio.threads),
         )
+        yield from self._audio_threads()
         yield self._level_costs()
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
+
+    def _audio_threads(self) -> Iterator[Metric]:
+        streams = GaugeMetricFamily("nafir_audio_thread_streams", "Open streams of an audio thread.", labels=["thread"])
+        busy = GaugeMetricFamily(
+            "nafir_audio_thread_busy",
+            "Share of the last quarter of a second in which an audio thread rendered.",
+            labels=["thread"],
+        )
+        for name, (count, share) in self._host.audio.loads().items():
+            streams.add_metric([name], count)
+            busy.add_metric([name], share)
+        yield streams
+        yield busy
+        yield CounterMetricFamily(
+            "nafir_stream_moves",
+            "Moves of a stream to another audio thread, because the threads were unevenly busy.",
+            value=self._host.audio.moves,
+        )
 
     def _streams(self, streams: Iterable[Stream]) -> Iterator[Metric]:
         levels = Counter((stream.scene, stream.session.quality.level) for stream in streams)

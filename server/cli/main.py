@@ -9,15 +9,15 @@ import json
 import os
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from server.bench import cli as bench
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
 from server.core.errors import NafirError, RequestError
-from server.core.files import require_readable
 from server.health.cli import check
 from server.listening.cli import listening_results, listening_test
 from server.rendering.partitions import BLOCK_SIZES, is_block_size
@@ -25,6 +25,10 @@ from server.runtime.memory import collect_rarely_at_start
 from server.soak.cli import soak
 
 if TYPE_CHECKING:
+    import socket
+    from collections.abc import Sequence
+
+    from server.api.settings import Settings
     from server.field.field import AcousticField
     from server.offline.render import RenderedEmitter
     from server.planning.scene_acoustics import Output
@@ -83,49 +87,52 @@ def serve(
     hrtf: Annotated[
         list[Path] | None, typer.Option(help="SOFA file with a head to offer beside KEMAR; repeatable.")
     ] = None,
+    processes: Annotated[
+        int | None, typer.Option(help="Processes to serve with, each on an equal part of the cores. [default: 1]")
+    ] = None,
 ) -> None:
     """Serve scenes over HTTP and WebSocket, and a page to walk through them.
 
     Every setting can also come from the environment: NAFIR_HOST, NAFIR_PORT, NAFIR_BUNDLES, ...
     """
-    import uvicorn
-    from rich.console import Console
+    from server.api.listeners import bind, url_of
+    from server.api.settings import checked_settings
 
-    from server.api import serving
-    from server.api.app import create_app
-    from server.api.catalogue import load_hrtfs, load_scenes
-    from server.api.first_start import CompilingProcess
-    from server.api.settings import settings_of, usable_cores
-    from server.runtime.drain import Drain
-    from server.runtime.memory import give_back_large_arrays
-    from server.runtime.open_files import allow_connections
-    from server.scene.bundle import Bundle, bundled_scenes
-
-    give_back_large_arrays()
-    settings = settings_of({"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf})
-    allow_connections(settings.max_connections)
-    for name in ("clips", "hrtfs"):
-        for path in getattr(settings, name):
-            require_readable(path, name)
+    given = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf, "processes": processes}
+    settings = checked_settings(given)
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
-        listeners = [opened.enter_context(listener) for listener in serving.bind(settings.host, settings.port)]
-        compiler = opened.enter_context(CompilingProcess())
-        compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
-        scenes = load_scenes(settings.bundles)
-        if not scenes:
-            raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
-        hrtfs = load_hrtfs(settings.hrtfs, scenes)
+        listeners = [opened.enter_context(listener) for listener in bind(settings.host, settings.port)]
+        url = url_of(listeners[0], settings.host)
+        if settings.processes > 1:
+            _serve_in_processes(settings, given, listeners, url)
+        import uvicorn
+        from rich.console import Console
+
+        from server.api import serving
+        from server.api.start import loaded_app
+        from server.runtime.drain import Drain
+        from server.runtime.memory import give_back_large_arrays
+
+        give_back_large_arrays()
         drain = Drain(settings.drain_s)
-        application = create_app(settings, scenes=scenes, hrtfs=hrtfs, drain=drain, compiler=compiler)
-        url = serving.url(listeners[0], settings.host)
-        announcement = f"[bold]Nafir[/] serves {', '.join(scenes)} at [link]{url}[/]"
-        serving.serve(
-            uvicorn.Config(application, **serving.uvicorn_options(settings)),
-            listeners,
-            drain,
-            on_start=lambda: Console().print(announcement, highlight=False),
-        )
+        application, scenes = opened.enter_context(loaded_app(settings, drain))
+        announcement = serving.announcement(scenes, url)
+        config = uvicorn.Config(application, **serving.uvicorn_options(settings))
+        on_start = lambda: Console().print(announcement, highlight=False)  # noqa: E731
+        serving.serve(serving.Server(config, drain, on_start=on_start), listeners)
+
+
+def _serve_in_processes(
+    settings: "Settings", given: Mapping[str, Any], listeners: "Sequence[socket.socket]", url: str
+) -> NoReturn:
+    from server.api.processes import ProcessGroup, shares_of_cores
+
+    if not hasattr(os, "sched_getaffinity"):
+        raise NafirError("processes: this system cannot confine a process to cores: serve with one")
+    shares = shares_of_cores(sorted(os.sched_getaffinity(0)), settings.processes)
+    options = json.loads(json.dumps(given, default=str))
+    sys.exit(ProcessGroup(listeners, shares, options, url=url, drain_s=settings.drain_s).run())
 
 
 @app.command()

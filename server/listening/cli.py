@@ -121,6 +121,7 @@ def _serve(folder: Path, given: dict[str, str | int | None]) -> None:
     from rich.console import Console
 
     from server.api import serving
+    from server.api.listeners import bind, url_of
     from server.api.settings import settings_of
     from server.core.files import require_writable_folder
     from server.listening.app import create_app
@@ -131,16 +132,18 @@ def _serve(folder: Path, given: dict[str, str | int | None]) -> None:
     test = ListeningTest.open(folder)
     require_writable_folder(test.results, "TEST")
     settings = settings_of(given)
-    listeners = serving.bind(settings.host, settings.port)
+    listeners = bind(settings.host, settings.port)
     drain = Drain(settings.drain_s)
     application = create_app(Listeners(test), settings, drain)
-    url = serving.url(listeners[0], settings.host)
+    url = url_of(listeners[0], settings.host)
     asked = "choices" if test.design.kind == "choice" else "ratings"
     announcement = f"[bold]Nafir[/] asks for {asked} in {test.design.name} at [link]{url}[/]; answers: {test.results}"
     # The log of requests would hold addresses and codes together.
     config = uvicorn.Config(application, access_log=False, **serving.uvicorn_options(settings))
     try:
-        serving.serve(config, listeners, drain, on_start=lambda: Console().print(announcement, highlight=False))
+        serving.serve(
+            serving.Server(config, drain, on_start=lambda: Console().print(announcement, highlight=False)), listeners
+        )
     finally:
         for listener in listeners:
             listener.close()

@@ -1,8 +1,8 @@
 """The threads that render every stream, one per core.
 
 A hop through an executor costs a millisecond per block; a thread that stays awake for its streams costs none. A stream
-stays on the thread that was least busy when it opened. Impulse responses (IRs) are computed by a pool of workers and
-picked up at the next block: an audio thread never waits for a field or for the network.
+opens on the least busy thread. Impulse responses (IRs) are computed by a pool of workers and picked up at the next
+block: an audio thread never waits for a field or for the network.
 
 **When blocks fall due.** Every block of a stream is due at a whole number of block durations from the stream's origin.
 With arbitrary origins, a thread would wake for every block of every stream, and each time the interpreter's lock, the
@@ -20,6 +20,11 @@ instant render their groups of blocks at different times, so that every instant 
 decision of the load policy (`server.streaming.load_policy`): how many blocks at once, which quality, how often
 responses.
 
+**Moves.** If threads become uneven, a stream moves from one to another (`server.streaming.balance`). The old thread
+lets go of it when it has just rendered a block of it, so that nearly a whole block is left until the next is due, and
+the event loop hands it to the new thread. Its samples and deadlines stay as they were. Its blocks are rendered at an
+instant of the new thread, less than a block earlier than before.
+
 A message that may call for an IR wakes the thread at once. The thread then requests the IR, but renders nothing early.
 Streams take turns with requests (`server.streaming.request_queue`).
 
@@ -33,8 +38,9 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from operator import attrgetter
 from typing import NamedTuple, get_args
@@ -44,6 +50,7 @@ from server.rendering.renderer import render_all
 from server.runtime.priority import become_real_time
 from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
+from server.streaming.balance import BalanceState, ThreadLoad, balance
 from server.streaming.load_policy import LoadState, Measurement, RenderAhead, ThreadState, decide, requests_at_once
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.request_queue import RequestQueue
@@ -67,6 +74,8 @@ _SWITCH_S = 0.0005
 """How long another thread may keep the interpreter's lock from an audio thread. With the usual 5 ms, a thread that is
 busy half of the time delays audio by more than a block."""
 _STOP_S = 1.0
+_STALE_S = 1.0
+"""Age from which on a measurement says nothing of a thread. One that works measures four times a second."""
 _FAILED = "a stream failed and is closed"
 _logger = logging.getLogger(__name__)
 
@@ -97,11 +106,24 @@ class AudioEngine:
     ) -> None:
         self._workers = workers
         self._thresholds = thresholds
+        self._time_s = time_s
         self.threads = [
-            AudioThread(post, workers, number=number, is_real_time=is_real_time, thresholds=thresholds, time_s=time_s)
+            AudioThread(
+                post,
+                workers,
+                number=number,
+                is_real_time=is_real_time,
+                thresholds=thresholds,
+                time_s=time_s,
+                after_look=self._balance if threads > 1 else None,
+            )
             for number in range(threads)
         ]
+        self.moves = 0
+        """How often a stream was moved to another thread."""
         self._thread_of: dict[Stream, AudioThread] = {}
+        self._balance_state: BalanceState[Stream] = BalanceState()
+        self._balanced_s = -math.inf
         self._switch_s_before = sys.getswitchinterval()
 
     def start(self) -> None:
@@ -130,11 +152,10 @@ class AudioEngine:
         return sum((thread.steps for thread in self.threads), Counter())
 
     def open(self, stream: Stream) -> None:
-        """Start a stream now, on the least busy thread."""
-        loads = dict.fromkeys(self.threads, 0.0)
-        for other, thread in self._thread_of.items():
-            loads[thread] += max(self._thresholds.presumed_load, other.load)
-        thread = min(self.threads, key=loads.__getitem__)
+        """Start a stream now, on the least busy thread. If all of them are dead or stuck, on the least busy of all."""
+        loads = self._loads()
+        able = [thread for thread in self.threads if thread.busy is not None] or self.threads
+        thread = min(able, key=lambda thread: sum(loads[thread].values()))
         self._thread_of[stream] = thread
         self._share_workers()
         thread.open(stream)
@@ -165,6 +186,49 @@ class AudioEngine:
         for stream in self._streams_of(stuck):
             stream.deliver([StreamFailed()])
 
+    @property
+    def demand(self) -> float:
+        """How many cores the blocks of all streams take. It belongs to the event loop."""
+        return sum(sum(streams.values()) for streams in self._loads().values())
+
+    def loads(self) -> dict[str, tuple[int, float]]:
+        """Number of streams of each thread, by name, and the share of the last period in which it rendered. Any thread
+        may call this."""
+        counts = Counter(tuple(self._thread_of.values()))
+        return {thread.name: (counts[thread], thread.busy or 0.0) for thread in tuple(self.threads)}
+
+    def _loads(self) -> dict["AudioThread", dict[Stream, float]]:
+        """Return the share of a core of each stream, by thread. A stream that has just opened has shown little of what
+        it will need, so it is taken to need as much as the others do on average."""
+        heard = [stream.load for stream in self._thread_of if stream.is_measured]
+        presumed = max(self._thresholds.presumed_load, sum(heard) / len(heard) if heard else 0.0)
+        loads: dict[AudioThread, dict[Stream, float]] = {thread: {} for thread in self.threads}
+        for stream, thread in self._thread_of.items():
+            loads[thread][stream] = stream.load if stream.is_measured else max(presumed, stream.load)
+        return loads
+
+    def _balance(self) -> None:
+        """Move a stream if the threads call for it. Audio threads post this whenever they have measured their load."""
+        now_s = self._time_s()
+        if now_s - self._balanced_s < self._thresholds.period_s:
+            return
+        self._balanced_s = now_s
+        loads = self._loads()
+        measured = [None if thread.busy is None else ThreadLoad(thread.busy, loads[thread]) for thread in self.threads]
+        self._balance_state, move = balance(self._thresholds, self._balance_state, now_s, measured)
+        if move is not None:
+            source = self.threads[move.source]
+            source.hand_over(move.key, partial(self._take_over, move.key, source, move.target))
+
+    def _take_over(self, stream: Stream, source: "AudioThread", number: int) -> None:
+        """Let a stream continue on the thread with this number, now that its old thread has let go of it."""
+        if self._thread_of.get(stream) is not source:
+            return  # it was closed, or continues on the successor of a thread that died
+        thread = self._thread_of[stream] = self.threads[number]
+        self.moves += 1
+        self._share_workers()
+        thread.take_over(stream)
+
     def _streams_of(self, thread: Watched) -> list[Stream]:
         return [stream for stream, its_thread in self._thread_of.items() if its_thread is thread]
 
@@ -189,6 +253,7 @@ class AudioThread:
         is_real_time: bool,
         thresholds: Thresholds,
         time_s: Callable[[], float],
+        after_look: Callable[[], None] | None,
     ) -> None:
         self._post = post
         self._workers = workers
@@ -198,15 +263,21 @@ class AudioThread:
         self._is_real_time = is_real_time
         self._thresholds = thresholds
         self._time_s = time_s
+        self._after_look = after_look
+        """Posted to the event loop after each measurement."""
         # It has all reasons from the start: a reader on another thread must not see it grow.
         self.steps: Counter[LevelReason] = Counter(dict.fromkeys(get_args(LevelReason), 0))
         """How often the quality of a stream was changed, by reason."""
         self._load = ThreadState()
         self._busy_s = 0.0
+        self._busy = 0.0
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """The streams, each with its place: its phase, and the block at which its groups of blocks begin."""
-        self._arrivals: deque[tuple[Stream, bool]] = deque()
+        self._calls: deque[Callable[[float], None]] = deque()
+        """What the next tick does first, with the time."""
+        self._leaving: dict[Stream, Callable[[], None]] = {}
+        """Streams to let go of, each with what is then called on the event loop."""
         self._origin_s: float | None = None
         self._wake = threading.Event()
         self._has_arrived = threading.Event()
@@ -221,6 +292,15 @@ class AudioThread:
     def blocks_at_once(self) -> int:
         """How many blocks of a stream are rendered together."""
         return self._load.ahead.blocks
+
+    @property
+    def busy(self) -> float | None:
+        """The share of the last period in which it rendered; None if it is dead or stuck. Any thread may call this."""
+        if self.is_dead:
+            return None
+        if self._time_s() - self._looked_s <= _STALE_S:
+            return self._busy
+        return None if self._is_ticking else 0.0
 
     @property
     def name(self) -> str:
@@ -248,6 +328,7 @@ class AudioThread:
             is_real_time=self._is_real_time,
             thresholds=self._thresholds,
             time_s=self._time_s,
+            after_look=self._after_look,
         )
         thread.steps = self.steps
         return thread
@@ -262,12 +343,28 @@ class AudioThread:
             self._thread.join(timeout_s)
 
     def open(self, stream: Stream) -> None:
-        stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self.turns)
-        self._arrivals.append((stream, True))
-        self._wake.set()
+        """Start a stream."""
+        self._attach(stream)
+        self._call(partial(self._start, stream))
+
+    def take_over(self, stream: Stream) -> None:
+        """Continue a stream that another thread has let go of."""
+        self._attach(stream)
+        self._call(partial(self._continue, stream))
 
     def close(self, stream: Stream) -> None:
-        self._arrivals.append((stream, False))
+        self._call(partial(self._end, stream))
+
+    def hand_over(self, stream: Stream, then: Callable[[], None]) -> None:
+        """Let go of a stream after its next block, or at once if it is paused, and post `then` to the event loop, where
+        it comes after the stream's output. If the stream is closed or fails before, nothing is called."""
+        self._call(partial(self._leave, stream, then))
+
+    def _attach(self, stream: Stream) -> None:
+        stream.attach(wake=self._wake.set, time_s=self._time_s, turns=self.turns)
+
+    def _call(self, call: Callable[[float], None]) -> None:
+        self._calls.append(call)
         self._wake.set()
 
     def tick(self) -> float | None:
@@ -276,7 +373,8 @@ class AudioThread:
         Return the seconds until the next block is due; None if there is no stream to render.
         """
         now_s = self._time_s()
-        self._admit(now_s)
+        while self._calls:
+            self._calls.popleft()(now_s)
         made: dict[Stream, list[Outgoing]] = {}
         due: list[_Due] = []
         blocks_of = self._due(now_s)
@@ -303,6 +401,8 @@ class AudioThread:
         if any(made.values()):
             self._has_arrived.clear()
             self._post(lambda: self._deliver(made))
+        if self._leaving:
+            self._let_go({each.stream for each in due})
         next_s = min((stream.due_s for stream in self._streams), default=math.inf)
         return None if next_s == math.inf else next_s - self._time_s()
 
@@ -365,7 +465,8 @@ class AudioThread:
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
         """Measure the load of the thread and its streams, and carry out the decision of the load policy."""
-        busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
+        self._busy = busy = self._busy_s / (now_s - self._looked_s)
+        self._busy_s = 0.0
         self._looked_s = now_s
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
         measurement = Measurement(now_s, busy, {stream: stream.sample_load(now_s) for stream in self._streams})
@@ -379,36 +480,76 @@ class AudioThread:
         for stream in self._streams:
             stream.set_intervals(decision.ir_intervals_s[stream], decision.plan_intervals_s[stream])
             stream.company = len(self._streams)
+        if self._after_look is not None:
+            self._post(self._after_look)
 
     def _fail(self, stream: Stream, made: dict[Stream, list[Outgoing]]) -> None:
         """Drop a stream that failed; the others keep playing."""
         del self._streams[stream]
         made.setdefault(stream, []).append(StreamFailed())
 
-    def _admit(self, now_s: float) -> None:
-        while self._arrivals:
-            stream, is_opening = self._arrivals.popleft()
-            if is_opening:
-                if not self._streams:
-                    self._load = replace(self._load, ahead=RenderAhead())
-                place = self._freest_place(stream.block_s)
-                stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
-                self._streams[stream] = place
-            else:
-                self._streams.pop(stream, None)
-                stream.leave()
+    def _start(self, stream: Stream, now_s: float) -> None:
+        if not self._streams:
+            self._load = replace(self._load, ahead=RenderAhead())
+        place = self._freest_place(stream.block_s)
+        stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
+        self._streams[stream] = place
 
-    def _freest_place(self, block_s: float) -> int:
+    def _continue(self, stream: Stream, now_s: float) -> None:
+        if not self._streams:
+            self._load = replace(self._load, ahead=RenderAhead())
+        if self._origin_s is None:
+            self._origin_s = now_s
+        block_s, due_s = stream.block_s, stream.clock.origin_s
+
+        def early_s(place: int) -> float:
+            assert self._origin_s is not None
+            after_s = (due_s - self._origin_s - place % PHASES / PHASES * block_s) % block_s
+            return 0.0 if block_s - after_s < _EARLY_S else after_s
+
+        place = self._freest_place(block_s, early_s)
+        stream.change_thread(early_s(place), now_s)
+        self._streams[stream] = place
+        self._load = self._load.restarted
+
+    def _leave(self, stream: Stream, then: Callable[[], None], _: float) -> None:
+        if stream in self._streams:
+            self._leaving[stream] = then
+
+    def _end(self, stream: Stream, _: float) -> None:
+        self._streams.pop(stream, None)
+        stream.leave()
+
+    def _let_go(self, rendered: Set[Stream]) -> None:
+        """Let go of streams that are to leave: of those just `rendered`, whose next block has the most time, and of
+        those that are paused."""
+        for stream, then in tuple(self._leaving.items()):
+            if stream not in self._streams:  # it was closed or has failed
+                del self._leaving[stream]
+            elif stream in rendered or stream.due_s == math.inf:
+                del self._leaving[stream], self._streams[stream]
+                self._load = self._load.restarted
+                self._post(then)
+
+    def _freest_place(self, block_s: float, early_s: Callable[[int], float] = lambda _: 0.0) -> int:
         """Return the place with the fewest streams of the same block duration: in its phase, and among those that would
-        be rendered with it, two blocks at once or more. Among equal places, take one apart from those taken before: an
-        instant with more work should be followed by one with less, or the event loop and IRs get no time for long."""
+        be rendered with it, two blocks at once or more. Of equal phases, take that with the least `early_s`. Among
+        equal places, take one apart from those taken before: an instant with more work should be followed by one with
+        less, or the event loop and IRs get no time for long."""
         taken = [place for stream, place in self._streams.items() if stream.block_s == block_s]
         *periods, cycle = [PHASES * count for count in self._thresholds.blocks_at_once]
 
-        def company(place: int) -> list[int]:
+        def company(place: int) -> list[float]:
+            phase = sum((other - place) % PHASES == 0 for other in taken)
             alike = [sum((other - place) % period == 0 for other in taken) for period in periods]
             # With the most blocks at once, all phases of a block are rendered together.
-            return [*alike, sum(other // PHASES == place // PHASES for other in taken), taken.count(place)]
+            return [
+                phase,
+                early_s(place),
+                *alike,
+                sum(other // PHASES == place // PHASES for other in taken),
+                taken.count(place),
+            ]
 
         return min((number * _APART % cycle for number in range(cycle)), key=company)
 

@@ -112,6 +112,11 @@ class RenderAhead:
     caution: int = 1
     periods_since_fewer: int | None = None
 
+    @property
+    def restarted(self) -> "RenderAhead":
+        """The same number of blocks, with means that begin anew."""
+        return replace(self, mean_busy=0.0, periods=0, long_mean=0.0)
+
 
 @dataclass(frozen=True)
 class ThreadState:
@@ -122,6 +127,12 @@ class ThreadState:
     well_since_s: float | None = None
     moved_s: float = -math.inf
     """When the thread last made streams step down."""
+
+    @property
+    def restarted(self) -> "ThreadState":
+        """The state after a stream has come from another thread or left for one: earlier measurements say nothing of
+        the load from now on, so neither steps down nor steps up may follow from them."""
+        return replace(self, ahead=self.ahead.restarted, overloaded_periods=0, well_since_s=None)
 
 
 @dataclass(frozen=True)

@@ -102,5 +102,19 @@ class Thresholds:
     """Share of a core that a new stream is taken to need at least, until it has shown more: streams that come together
     are spread over the threads."""
 
+    least_gain: float = 0.08
+    """Share of a core by which the busier of two audio threads has to become less busy for a stream to move: more than
+    measurements of a steady load differ by, and less than a stream of sixteen emitters takes."""
+    uneven_periods: int = 8
+    """Periods in a row that call for a move before a stream moves: two seconds, in which a short load has passed and
+    the last move shows in what is measured."""
+    full_periods: int = 4
+    """The same for a thread that is busier than `full_busy` on average. The mean has followed by then."""
+    load_known_s: float = 3.0
+    """Seconds for which a stream that has just come stays where it is. Then it has its emitters, and its load is
+    measured."""
+    stay_s: float = 10.0
+    """Seconds for which a stream stays on its thread after a move."""
+
 
 THRESHOLDS: Final = Thresholds()

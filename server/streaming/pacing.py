@@ -13,17 +13,19 @@ class StreamClock:
     """Due times and deadlines of one stream's blocks."""
 
     def __init__(self, *, origin_s: float, block_s: float, lead: int) -> None:
-        self._origin_s = origin_s
+        self.origin_s = origin_s
+        self.early_s = 0.0
+        """How much earlier than `lead` blocks before they play blocks are rendered. Deadlines do not depend on it."""
         self._block_s = block_s
         self._lead = lead
 
     def due_s(self, block: int) -> float:
         """When block `block` should be rendered."""
-        return self._origin_s + (block - self._lead) * self._block_s
+        return self.origin_s + (block - self._lead) * self._block_s - self.early_s
 
     def deadline_s(self, block: int) -> float:
         """Return when a player with `lead` blocks in hand needs block `block`; a block after that is late."""
-        return self._origin_s + block * self._block_s
+        return self.origin_s + block * self._block_s
 
     def ahead_s(self, block: int, now_s: float) -> float:
         """Return how far ahead of real time a stream is if its next block is `block`; negative if it is behind."""
@@ -33,7 +35,7 @@ class StreamClock:
         """Move the origin by whole blocks so that `block` is due next. After a stall, sound then resumes instead of
         arriving in a burst, and other streams' blocks still fall due between this one's."""
         # guard: a stall moves a clock by whole blocks
-        self._origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
+        self.origin_s += math.ceil((now_s - self.due_s(block)) / self._block_s) * self._block_s
 
 
 class SendWindow:

@@ -38,6 +38,8 @@ PAUSE_AFTER_S = 1.0
 the window are lost."""
 _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
+_MEASURED_AFTER_S = 2.0
+"""Seconds of sound until a stream has its emitters, and the smoothed load has followed."""
 _COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
 
@@ -175,6 +177,18 @@ class Stream:
         first_s = origin_s - self.next_block * self.block_s
         self._clock = StreamClock(origin_s=first_s, block_s=self.block_s, lead=self._lead)
         self.due_s = self._clock.due_s(self.next_block)
+
+    def change_thread(self, early_s: float, now_s: float) -> None:
+        """Continue on another thread, which renders blocks `early_s` before the others of their clock: so deadlines
+        stay as they are. A block that so would have been due in the past is due now."""
+        self.clock.early_s = early_s
+        if not self._pause.is_paused:
+            self.due_s = max(self.clock.due_s(self.next_block), now_s)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the stream plays for so long that `load` is what it takes."""
+        return self.next_block * self.block_s >= _MEASURED_AFTER_S
 
     @property
     def clock(self) -> StreamClock:

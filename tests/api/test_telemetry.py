@@ -128,6 +128,20 @@ def test_how_many_blocks_are_rendered_at_once_is_told(host):
     assert samples(host)["nafir_blocks_at_once",] == 4
 
 
+def test_streams_and_busy_share_of_each_audio_thread_are_told(host, field, filters):
+    stream = open_stream(host, field, filters)
+    (thread,) = host.audio.threads
+    thread._busy = 0.25
+    host.audio.moves = 3
+    told = samples(host)
+    of_thread = ("thread", thread.name)
+    assert told["nafir_audio_thread_streams", of_thread] == 1
+    assert told["nafir_audio_thread_busy", of_thread] == 0.25
+    assert told["nafir_stream_moves_total",] == 3
+    host.audio.close(stream)
+    assert samples(host)["nafir_audio_thread_streams", of_thread] == 0
+
+
 def test_a_histogram_sums_what_it_counts():
     first, second = DurationHistogram(), DurationHistogram()
     first.add(0.5)

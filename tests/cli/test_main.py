@@ -359,8 +359,15 @@ def test_a_port_in_use_ends_serve_at_once_before_anything_is_loaded_and_nothing_
 @pytest.mark.parametrize("option", ["clip", "hrtf"])
 def test_serve_looks_at_the_files_it_is_given_before_anything_else(nafir, monkeypatch, tmp_path, option):
     monkeypatch.setattr("server.api.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
-    monkeypatch.setattr("server.api.serving.bind", lambda *_: pytest.fail("a port is bound"))
+    monkeypatch.setattr("server.api.listeners.bind", lambda *_: pytest.fail("a port is bound"))
     check_error(nafir("serve", "--port", 0, f"--{option}", tmp_path / "missing.x"), f"{option}s", "missing.x")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot confine a process to cores")
+def test_more_processes_than_cores_are_refused_before_any_is_started(nafir, monkeypatch):
+    monkeypatch.setattr("server.api.processes.subprocess.Popen", lambda *_, **__: pytest.fail("a process is started"))
+    check_error(nafir("serve", "--port", 0, "--processes", 5_000), "processes", "5000", "cores")
+    check_error(nafir("serve", "--port", 0, "--processes", 0), "processes")
 
 
 @pytest.mark.parametrize("place", ["missing/out", "file/out", "."])
