@@ -1,4 +1,4 @@
-"""A server of the benchmark's scene in a process of its own, confined to one core: `python -m server.bench.host CORE`.
+"""A server of one scene in a process of its own, confined to one core: `python -m server.bench.host CORE SCENE`.
 
 It prints its port in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """
@@ -15,15 +15,17 @@ if TYPE_CHECKING:
     import uvicorn
 
 _MAX_STREAMS = 1_000
+"""Streams, and connections of one address, that the benchmark may open: no limit of the server is to end a search."""
 _CLIP_S = 10
 
 
 def main() -> None:
-    os.sched_setaffinity(0, {int(sys.argv[1])})
-    serve()  # imported modules start threads and count cores, so they are imported only now
+    core, scene = sys.argv[1:]
+    os.sched_setaffinity(0, {int(core)})
+    serve(scene)  # imported modules start threads and count cores, so they are imported only now
 
 
-def serve() -> None:
+def serve(scene: str) -> None:
     import socket
 
     import soundfile
@@ -34,16 +36,18 @@ def serve() -> None:
     from server.api.settings import Settings
     from server.bench.gauge import Gauge
     from server.bench.rooms import noise
-    from server.bench.scene import CLIP, SAMPLE_RATE, SCENE, BankField
-    from server.field.fields_by_level import FieldsByLevel
+    from server.bench.scene import CLIP, SAMPLE_RATE, levels_of
     from server.runtime.memory import give_back_large_arrays
+    from server.runtime.open_files import allow_connections
 
     give_back_large_arrays()
     with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
         clip = Path(folder) / f"{CLIP}.wav"
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
-        settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS)
-        app = Gauge(create_app(settings, scenes={SCENE: FieldsByLevel([BankField()])}))
+        levels = levels_of(scene)
+        settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS, max_connections_per_address=_MAX_STREAMS)
+        allow_connections(settings.max_connections)
+        app = Gauge(create_app(settings, scenes={levels.bundle.id: levels}))
         server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
         listener.bind((settings.host, 0))
         threading.Thread(target=_stop_with_input, args=(server,), daemon=True).start()
