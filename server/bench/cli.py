@@ -25,7 +25,7 @@ from server.bench.report import (
     print_measures,
     print_rows,
 )
-from server.core.command_line import StrictTyper, require_at_most_one, writable_folder
+from server.core.command_line import StrictTyper, require_at_most_one, writable_file, writable_folder
 from server.core.errors import NafirError
 
 
@@ -194,6 +194,49 @@ def stream(
         _print_sessions(measured, judgements)
     interrupted = [] if measured["is_complete"] else ["it was interrupted"]
     return Outcome.judged("stream", judgements, [*failures(measured["cases"]), *interrupted])
+
+
+@app.command()
+def costs(
+    scene: Annotated[
+        str, typer.Option(help="A bundled scene's id, the folder of any scene bundle, or `bench`.")
+    ] = "apartment",
+    poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="File for `nafir plan-capacity --costs`.", callback=writable_file),
+    ] = None,
+    as_json: AsJson = False,
+) -> Outcome:
+    """Where a listener-second goes: what each part of a server on one core costs, with few sessions and with many.
+
+    Two minutes. Capacity is planned from these costs, on this machine or, with a file of them, on any other.
+    """
+    from server.bench.costs import listener_second, measure_costs, write_costs
+    from server.bench.machine import describe_machine
+
+    measured = measure_costs(scene, poses_per_s=poses_per_second, advance=_steps_told())
+    if output is not None:
+        write_costs(output, measured)
+    rows = [listener_second(run) for run in measured.runs]
+    if as_json:
+        tables = [
+            {"sessions": run.sessions, "emitters": run.emitters, "parts": parts}
+            for run, parts in zip(measured.runs, rows, strict=True)
+        ]
+        print_json({"host": describe_machine(), "costs": measured.model_dump(mode="json"), "listener_second": tables})
+    else:
+        print_measures("Host", describe_machine())
+        for run, parts in zip(measured.runs, rows, strict=True):
+            late = f"{run.late_share:.1%} late"
+            print_rows(f"A listener-second of {run.sessions} × {run.emitters} in {measured.scene}, {late}", parts)
+    figures: dict[str, float | None] = {
+        f"{measured.scene}, {run.sessions} sessions of {run.emitters} emitters, ms a listener-second": sum(
+            part["ms"] for part in parts
+        )
+        for run, parts in zip(measured.runs, rows, strict=True)
+    }
+    return Outcome("costs", figures)
 
 
 @app.command()

@@ -9,18 +9,21 @@ server has finished its one-time work after the start.
 
 import asyncio
 import json
+import os
 import struct
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.connection import StreamHost
 from server.api.web_socket import watched
+from server.bench.meter import Meter, Spent, Thread
 from server.core.durations import DurationHistogram
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
@@ -114,15 +117,22 @@ class _Counts:
 
 
 class Gauge:
-    """An ASGI application around the server's. Everything runs on its event loop."""
+    """An ASGI application around the server's. Everything runs on its event loop. With a `meter`, reports say what each
+    part of the work cost."""
 
-    def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic, meter: Meter | None = None
+    ) -> None:
         self._app = app
         self._time_s = time_s
+        self._meter = meter
+        self._began_spent: dict[tuple[Thread, str], Spent] = {}
         self._watches: set[_Watch] = set()
         self._counts: list[_Counts] = []
         self._began_s = self._began_cpu_s = 0.0
         self._began_thread_cpu_s: dict[threading.Thread, float] = {}
+        self._received = 0
+        """Messages of clients."""
         self._looks = self._below_best = 0
         """Looks at the quality of streams, and those that found it below the best of their ladder."""
         self._next_look: asyncio.TimerHandle | None = None
@@ -148,6 +158,7 @@ class Gauge:
         watch = _Watch()
 
         def see_pose(data: str | bytes) -> None:
+            self._received += 1
             if isinstance(data, bytes) and data and data[0] == ListenerPose.KIND:
                 (pose_id,) = POSE_ID.unpack_from(data)
                 now_s = self._time_s()
@@ -156,7 +167,7 @@ class Gauge:
 
         async def receive_pose() -> Message:
             message = await receive()
-            see_pose(message.get("bytes") or b"")
+            see_pose(message.get("bytes") or message.get("text") or b"")
             return message
 
         def see_blocks(messages: Sequence[bytes]) -> None:
@@ -187,6 +198,9 @@ class Gauge:
         if self._next_look is not None:
             self._next_look.cancel()
         self._look_again()
+        self._received = 0
+        if self._meter is not None:
+            self._began_spent = self._meter.spent()
         self._began_s, self._began_cpu_s = self._time_s(), time.process_time()
         self._began_thread_cpu_s = {thread: _thread_cpu_s(thread) for thread in threading.enumerate()}
 
@@ -222,7 +236,22 @@ class Gauge:
             "below_best_share": self._below_best / self._looks if self._looks else 0.0,
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
             "server_load_by_thread": self._loads_by_thread(duration_s),
+            "messages": self._received,
+            "resident_bytes": resident_bytes(),
+            **self._parts(),
         }
+
+    def _parts(self) -> dict[str, Any]:
+        """What each part of the work has cost since the beginning."""
+        if self._meter is None:
+            return {}
+        parts = []
+        for (thread, part), now in self._meter.spent().items():
+            before = self._began_spent.get((thread, part), Spent())
+            calls = now.calls - before.calls
+            spent = {"cpu_s": now.cpu_s - before.cpu_s, "calls": calls, "units": now.units - before.units}
+            parts.append({"thread": thread, "part": part, **spent})
+        return {"parts": parts, "meter_call_s": self._meter.cost_s()}
 
     def _look_again(self) -> None:
         self._look_at_quality()
@@ -251,6 +280,12 @@ def _describe(quality: QualityStep) -> str:
 def _thread_cpu_s(thread: threading.Thread) -> float:
     assert thread.ident is not None
     return time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+
+
+def resident_bytes() -> int | None:
+    """Memory of this process that is in use now; None where the system does not say."""
+    status = Path("/proc/self/statm")
+    return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if status.exists() else None
 
 
 def merged(histograms: Iterable[DurationHistogram]) -> dict[str, float | None]:

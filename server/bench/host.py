@@ -1,6 +1,8 @@
-"""A server of one scene in a process of its own, confined to one core: `python -m server.bench.host CORE SCENE`.
+"""A server of one scene in a process of its own, confined to one core:
+`python -m server.bench.host CORE SCENE [--meter]`.
 
-It prints its port in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
+With `--meter` it measures what each part of its work costs (`server.bench.meter`). It prints its port and the memory
+that the scene took in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """
 
 import json
@@ -20,12 +22,14 @@ _CLIP_S = 10
 
 
 def main() -> None:
-    core, scene = sys.argv[1:]
+    core, scene, *options = sys.argv[1:]
     os.sched_setaffinity(0, {int(core)})
-    serve(scene)  # imported modules start threads and count cores, so they are imported only now
+    serve(
+        scene, is_metered="--meter" in options
+    )  # imported modules start threads and count cores, so they are imported only now
 
 
-def serve(scene: str) -> None:
+def serve(scene: str, *, is_metered: bool) -> None:
     import socket
 
     import soundfile
@@ -34,7 +38,8 @@ def serve(scene: str) -> None:
     from server.api.app import create_app
     from server.api.serving import uvicorn_options
     from server.api.settings import Settings
-    from server.bench.gauge import Gauge
+    from server.bench.gauge import Gauge, resident_bytes
+    from server.bench.meter import Meter
     from server.bench.rooms import noise
     from server.bench.scene import CLIP, SAMPLE_RATE, levels_of
     from server.runtime.memory import give_back_large_arrays
@@ -44,14 +49,21 @@ def serve(scene: str) -> None:
     with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
         clip = Path(folder) / f"{CLIP}.wav"
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
+        before = resident_bytes()
         levels = levels_of(scene)
+        after = resident_bytes()
+        meter = Meter() if is_metered else None
+        if meter is not None:
+            meter.install()
         settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS, max_connections_per_address=_MAX_STREAMS)
         allow_connections(settings.max_connections)
-        app = Gauge(create_app(settings, scenes={levels.bundle.id: levels}))
+        app = Gauge(create_app(settings, scenes={levels.bundle.id: levels}), meter=meter)
         server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
         listener.bind((settings.host, 0))
         threading.Thread(target=_stop_with_input, args=(server,), daemon=True).start()
-        sys.stdout.write(json.dumps({"port": listener.getsockname()[1]}) + "\n")
+        sys.stdout.write(
+            json.dumps({"port": listener.getsockname()[1], "scene_bytes": (after or 0) - (before or 0)}) + "\n"
+        )
         sys.stdout.flush()
         server.run(sockets=[listener])
 

@@ -49,7 +49,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from server.bench.crowd import BLOCK_SIZE, Crowd
 from server.bench.gauge import latencies
@@ -67,9 +67,11 @@ _SETTLE_S = 2.0
 _LOOK_EVERY_S = 2.0
 _MOST = 512
 _PATIENCE_S = 20.0
-_READY_S = 120.0
+_READY_S = 600.0
 """Limit for becoming ready. Kernels may have to be compiled first."""
 
+MOST_EMITTERS = 16
+"""Emitters of a stream that the bench's server allows, as `nafir serve` does by default."""
 _BEHIND_S = 5.0
 """How long a reverberation may stand still while its listener moves."""
 _JUDGED = 20
@@ -130,8 +132,8 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
     try:
         with own_core() as (core, has_others):
             for scene, its_places in places.items():
-                with served(core, scene) as port:
-                    asyncio.run(_measure(plan, its_places, port, advance, cases))
+                with served(core, scene) as server:
+                    asyncio.run(_measure(plan, its_places, server.port, advance, cases))
     except KeyboardInterrupt:
         if not cases:
             raise
@@ -385,10 +387,18 @@ def _count_late(measured: dict[str, Any]) -> int:
     return sum(measured[name] for name in ("blocks_late", "blocks_dropped", "blocks_missing"))
 
 
+class Served(NamedTuple):
+    """A running server: its port, and the memory that its scene took when it was loaded."""
+
+    port: int
+    scene_bytes: int
+
+
 @contextlib.contextmanager
-def served(core: int, scene: str) -> Iterator[int]:
-    """Run a server of a scene on one core. Yields its port once it is ready and has measured the costs of effects."""
-    command = [sys.executable, "-m", "server.bench.host", str(core), scene]
+def served(core: int, scene: str, *, is_metered: bool = False) -> Iterator[Served]:
+    """Run a server of a scene on one core. Yields where it is once it is ready and has measured the costs of effects.
+    With `is_metered` its reports say what each part of its work costs."""
+    command = [sys.executable, "-m", "server.bench.host", str(core), scene, *(["--meter"] if is_metered else [])]
     # In a process group of its own, so that Ctrl-C does not reach it. It ends with this process.
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
@@ -396,20 +406,20 @@ def served(core: int, scene: str) -> Iterator[int]:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            port = _read_port(process.stdout)
-            _wait_until(lambda: _is_ready(port))
-            _wait_until(lambda: _get(f"http://127.0.0.1:{port}/bench/settled")["is_settled"])
-            yield port
+            server = _read_served(process.stdout)
+            _wait_until(lambda: _is_ready(server.port))
+            _wait_until(lambda: _get(f"http://127.0.0.1:{server.port}/bench/settled")["is_settled"])
+            yield server
         finally:
             process.stdin.close()
             process.wait()
 
 
-def _read_port(stdout: IO[str]) -> int:
+def _read_served(stdout: IO[str]) -> Served:
     line = stdout.readline()
     if not line:
         raise NafirError("the bench's server did not start")
-    return int(json.loads(line)["port"])
+    return Served(**json.loads(line))
 
 
 def _wait_until(is_so: Callable[[], bool]) -> None:

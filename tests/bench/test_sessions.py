@@ -230,7 +230,7 @@ def test_a_goal_reached_at_less_than_the_best_quality_says_so():
 def test_the_bench_ends_with_code_1_where_its_run_failed(monkeypatch, run, code, emitters, form):
     @contextlib.contextmanager
     def served(_core, _scene):
-        yield 1
+        yield bench.Served(1, 0)
 
     async def measure(_plan, places, _port, _advance, cases):
         scene = {"scene": places.bundle.id, "emitters": emitters, "is_given": True}
@@ -324,7 +324,7 @@ def test_a_run_ends_once_it_has_failed(monkeypatch):
 def test_what_is_interrupted_keeps_what_it_has(monkeypatch, done):
     @contextlib.contextmanager
     def served(_core, _scene):
-        yield 1
+        yield bench.Served(1, 0)
 
     async def measure(_plan, _places, _port, _advance, cases):
         cases += [case_of(1, 3)] * done
