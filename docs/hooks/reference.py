@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from reference_commands import commands_of
 from reference_errors import error_definitions
+from reference_goals import bench_goals
 from reference_load import load_thresholds
 from reference_packages import package_matrix, packages
 from reference_schemas import manifest, settings
@@ -28,6 +29,7 @@ GENERATORS: Final[Mapping[str, Callable[[], str]]] = {
     "package-matrix": package_matrix,
     "load-thresholds": load_thresholds,
     "error-definitions": error_definitions,
+    "bench-goals": bench_goals,
 }
 _MARK: Final = re.compile(r"^<!-- generated: ([a-z-]+) -->$", re.MULTILINE)
 

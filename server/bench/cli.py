@@ -25,7 +25,7 @@ from server.bench.report import (
     print_measures,
     print_rows,
 )
-from server.core.command_line import StrictTyper, require_at_most_one, writable_folder
+from server.core.command_line import StrictTyper, require_at_most_one, writable_file, writable_folder
 from server.core.errors import NafirError
 
 
@@ -150,25 +150,42 @@ def start(
 
 @app.command()
 def stream(
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A bundled scene's id, the folder of any scene bundle, or `bench`, a scene that isolates rendering; "
+            "repeatable. [default: apartment, bench]"
+        ),
+    ] = None,
     emitters: Annotated[
-        list[int] | None, typer.Option(min=1, max=16, help="Of each session; repeatable. [default: 1, 4, 16]")
+        list[int] | None, typer.Option(min=1, max=16, help="Of each session; repeatable. [default: 1, 16]")
     ] = None,
     sessions: Annotated[
         int | None, typer.Option(min=1, help="How many sessions. [default: finds how many there can be]")
     ] = None,
     duration_s: Annotated[float, typer.Option(min=1, help="How long the run is that counts.")] = 60.0,
     poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
+    moving_emitters: Annotated[
+        bool, typer.Option("--moving-emitters", help="Emitters move as well, as often as their listener.")
+    ] = False,
     as_json: AsJson = False,
 ) -> Outcome:
     """How many sessions one core serves, with fewer than one block in a thousand late.
 
-    A search takes about five minutes for each number of emitters; a given number of sessions takes one and a half. Each
-    step is reported when it ends. After Ctrl-C the results so far are printed.
+    A goal has to hold in the apartment, whose responses a network computes, and in `bench`, where rendering is hardest
+    and responses cost nothing. A search takes about five minutes for each scene and number of emitters; a given number
+    of sessions takes one and a half. Each step is reported when it ends. After Ctrl-C the results so far are printed.
     """
     from server.bench.sessions import Plan, failures, measure_sessions
 
-    counts = tuple(emitters) if emitters else Plan.emitters
-    plan = Plan(emitters=counts, sessions=sessions, duration_s=duration_s, poses_per_s=poses_per_second)
+    plan = Plan(
+        scenes=tuple(dict.fromkeys(scene)) if scene else Plan.scenes,
+        emitters=tuple(emitters) if emitters else Plan.emitters,
+        sessions=sessions,
+        duration_s=duration_s,
+        poses_per_s=poses_per_second,
+        sways=moving_emitters,
+    )
     measured = measure_sessions(plan, _steps_told())
     judgements = [Judgement(**row) for row in measured["summary"]]
     if as_json:
@@ -177,6 +194,49 @@ def stream(
         _print_sessions(measured, judgements)
     interrupted = [] if measured["is_complete"] else ["it was interrupted"]
     return Outcome.judged("stream", judgements, [*failures(measured["cases"]), *interrupted])
+
+
+@app.command()
+def costs(
+    scene: Annotated[
+        str, typer.Option(help="A bundled scene's id, the folder of any scene bundle, or `bench`.")
+    ] = "apartment",
+    poses_per_second: Annotated[float, typer.Option(min=0, help="Of each listener; 0 to stand still.")] = 30.0,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="File for `nafir plan-capacity --costs`.", callback=writable_file),
+    ] = None,
+    as_json: AsJson = False,
+) -> Outcome:
+    """Where a listener-second goes: what each part of a server on one core costs, with few sessions and with many.
+
+    Two minutes. Capacity is planned from these costs, on this machine or, with a file of them, on any other.
+    """
+    from server.bench.costs import listener_second, measure_costs, write_costs
+    from server.bench.machine import describe_machine
+
+    measured = measure_costs(scene, poses_per_s=poses_per_second, advance=_steps_told())
+    if output is not None:
+        write_costs(output, measured)
+    rows = [listener_second(run) for run in measured.runs]
+    if as_json:
+        tables = [
+            {"sessions": run.sessions, "emitters": run.emitters, "parts": parts}
+            for run, parts in zip(measured.runs, rows, strict=True)
+        ]
+        print_json({"host": describe_machine(), "costs": measured.model_dump(mode="json"), "listener_second": tables})
+    else:
+        print_measures("Host", describe_machine())
+        for run, parts in zip(measured.runs, rows, strict=True):
+            late = f"{run.late_share:.1%} late"
+            print_rows(f"A listener-second of {run.sessions} × {run.emitters} in {measured.scene}, {late}", parts)
+    figures: dict[str, float | None] = {
+        f"{measured.scene}, {run.sessions} sessions of {run.emitters} emitters, ms a listener-second": sum(
+            part["ms"] for part in parts
+        )
+        for run, parts in zip(measured.runs, rows, strict=True)
+    }
+    return Outcome("costs", figures)
 
 
 @app.command()
@@ -280,11 +340,13 @@ def _print_convolver(measured: dict[str, Any], judgements: list[Judgement]) -> N
 
 def _print_sessions(measured: dict[str, Any], judgements: list[Judgement]) -> None:
     print_measures("Host", measured["host"])
+    print_rows("Scenes", measured["scenes"])
     for case in measured["cases"]:
-        rows = {name: value for name, value in case.items() if name not in {"emitters", "trials"}}
+        rows = {name: value for name, value in case.items() if name not in {"scene", "emitters", "trials"}}
         again = {name: rows.pop(name) for name in case if name.startswith("with_")}
         for name, measures in {"": rows, **again}.items():
-            print_measures(f"{case['emitters']} emitters {name}".replace("_", " "), measures)
+            title = f"{case['scene']}, {case['emitters']} emitters {name}".replace("_", " ")
+            print_measures(title, {**measures, "behind_s": max(measures.get("behind_s", ()), default=None)})
     print_judgements("Goals", judgements)
 
 

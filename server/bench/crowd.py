@@ -1,4 +1,5 @@
-"""Many clients of one server in one event loop. They walk in circles and read only the headers of audio blocks.
+"""Many clients of one server in one event loop. They walk in circles and read only the headers of audio blocks. Their
+emitters stand, or move as often as the listeners.
 
 The WebSocket client is minimal, so that it does not dominate the measured load. It needs a server that sends whole
 messages without extensions over the loopback interface.
@@ -16,18 +17,17 @@ from functools import partial
 
 import numpy as np
 
-from server.acoustics.geometry import Vector3
 from server.bench.gauge import POSE_IDS, Waiting
-from server.bench.scene import CLIP, SCENE
-from server.core.durations import DurationHistogram
+from server.bench.places import Circle, Places
+from server.bench.scene import CLIP
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, MoveEmitter
 
+BLOCK_SIZE = 256
+"""Samples of a block: what a hello asks for if it says nothing."""
 _ACKNOWLEDGE_EVERY = 4
-_CENTRE: Vector3 = (2.0, 2.0, 1.5)
-_RADIUS_M = 1.0
 _TURN_S = 12.0
-_PLACES = (0.5, 0.5, 0.5), (7.5, 2.5, 2.3)
+"""Seconds for a circle: half a metre a second on one of a metre."""
 _GOLDEN = 0.618
 """Phase between the poses of successive walkers, as a share of the period. It spreads any number of them evenly."""
 _PATIENCE_S = 10.0
@@ -76,15 +76,19 @@ class FrameReader:
 
 class Walker(asyncio.Protocol):
     """One client. The future `sounds` is done when all its emitters are heard, and fails with ConnectionError if that
-    becomes impossible."""
+    becomes impossible. With `sways` its emitters move on their circles."""
 
-    def __init__(self, places: Sequence[Vector3], *, phase: float, poses_per_s: float) -> None:
+    def __init__(
+        self, places: Places, emitters: Sequence[Circle], *, phase: float, poses_per_s: float, sways: bool
+    ) -> None:
         self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.poses = Waiting()
+        self.poses, self.reverberation = Waiting(), Waiting()
         self.blocks = 0
         self.errors: list[str] = []
         self._places = places
-        self._silent = len(places)
+        self._emitters = emitters
+        self._sways = sways
+        self._silent = len(emitters)
         self._phase = phase
         self._poses_per_s = poses_per_s
         self._reader = FrameReader()
@@ -92,7 +96,7 @@ class Walker(asyncio.Protocol):
         """Reply to the upgrade request as far as it has arrived; None once it is complete."""
         self._transport: asyncio.Transport | None = None
         self._next_pose: asyncio.TimerHandle | None = None
-        self._pose_ids = itertools.count(1)
+        self._pose_ids, self._steps = itertools.count(1), itertools.count(1)
         self._is_closing = False
         self.is_lost = False
 
@@ -137,7 +141,8 @@ class Walker(asyncio.Protocol):
 
     def begin(self) -> None:
         """Reset counts and times."""
-        self.poses.times = DurationHistogram()
+        self.poses.begin()
+        self.reverberation.begin()
         self.blocks = 0
         self.errors = []
 
@@ -150,9 +155,10 @@ class Walker(asyncio.Protocol):
             self._transport.abort()
 
     def _begin(self) -> None:
-        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=SCENE).serialize().encode())
-        for number, place in enumerate(self._places):
-            self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=place).serialize().encode())
+        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=self._places.bundle.id).serialize().encode())
+        for number, circle in enumerate(self._emitters):
+            position = circle.at(0.0) if self._sways else circle.centre
+            self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=position).serialize().encode())
         if self._poses_per_s > 0:
             self._next_pose = asyncio.get_running_loop().call_later(self._phase / self._poses_per_s, self._walk)
 
@@ -169,22 +175,29 @@ class Walker(asyncio.Protocol):
         if payload[0] != AudioBlock.KIND:
             return
         self.blocks += 1
-        self.poses.leave(POSE_IDS.unpack_from(payload)[0], time.monotonic())
+        now_s = time.monotonic()
+        for waiting, pose_id in zip((self.poses, self.reverberation), POSE_IDS.unpack_from(payload), strict=True):
+            waiting.leave(pose_id, now_s)
         if self.blocks % _ACKNOWLEDGE_EVERY == 0:
             (sequence,) = _SEQUENCE.unpack_from(payload)
             self._send(_TEXT, Acknowledge(sequence=sequence).serialize().encode())
 
     def _walk(self) -> None:
         loop = asyncio.get_running_loop()
-        pose_id = next(self._pose_ids)
+        step = next(self._steps)
         # Scheduled from the previous due time, so that delays do not add up.
         assert self._next_pose is not None
         self._next_pose = loop.call_at(self._next_pose.when() + 1 / self._poses_per_s, self._walk)
-        angle = 2 * math.pi * ((pose_id + self._phase) / self._poses_per_s / _TURN_S + self._phase)
-        x, y, z = _CENTRE
-        position = x + _RADIUS_M * math.cos(angle), y + _RADIUS_M * math.sin(angle), z
-        pose = ListenerPose(pose_id=pose_id, position=position, yaw=math.remainder(angle, 2 * math.pi))
-        self.poses.enter(pose_id, time.monotonic())
+        angle = 2 * math.pi * ((step + self._phase) / self._poses_per_s / _TURN_S + self._phase)
+        if self._sways:
+            for number, circle in enumerate(self._emitters):
+                moved = MoveEmitter(id=str(number), pose_id=next(self._pose_ids), position=circle.at(angle))
+                self._send(_TEXT, moved.serialize().encode())
+        pose_id = next(self._pose_ids)
+        yaw = math.remainder(angle, 2 * math.pi)
+        pose = ListenerPose(pose_id=pose_id, position=self._places.walk.at(angle), yaw=yaw)
+        for waiting in (self.poses, self.reverberation):
+            waiting.enter(pose_id, time.monotonic())
         self._send(_BINARY, pose.serialize_binary())
 
     def _send(self, opcode: int, payload: bytes) -> None:
@@ -201,15 +214,26 @@ class Walker(asyncio.Protocol):
 
 
 class Crowd:
-    """The walkers at the server on `port`. Each has `emitters` emitters at places of its own. With no poses they stand
-    still."""
+    """The walkers at the server on `port`. Each has `emitters` emitters at places of its own, which move as often as
+    the walker with `sways`. With no poses all stand still."""
 
-    def __init__(self, port: int, *, emitters: int, poses_per_s: float) -> None:
+    def __init__(self, port: int, places: Places, *, emitters: int, poses_per_s: float, sways: bool = False) -> None:
         self._port = port
-        self._emitters = emitters
-        self._poses_per_s = poses_per_s
+        self._places = places
+        self.emitters = emitters
+        self.poses_per_s = poses_per_s
+        self._sways = sways
         self._rng = np.random.default_rng(0)
         self.walkers: list[Walker] = []
+
+    @property
+    def scene(self) -> str:
+        return self._places.bundle.id
+
+    @property
+    def blocks_per_s(self) -> float:
+        """Blocks that each walker should get per second."""
+        return self._places.bundle.manifest.codec.sample_rate / BLOCK_SIZE
 
     async def resize(self, count: int) -> None:
         """Change to `count` walkers, and wait until all their emitters are heard. Raises ConnectionError or
@@ -221,9 +245,10 @@ class Crowd:
         self.walkers = kept
         loop = asyncio.get_running_loop()
         for number in range(len(self.walkers), count):
-            places = [tuple(place) for place in self._rng.uniform(*_PLACES, (self._emitters, 3)).tolist()]
+            emitters = self._places.emitters(self.emitters, self._rng)
             phase = number * _GOLDEN % 1
-            make = partial(Walker, places, phase=phase, poses_per_s=self._poses_per_s)
+            pace = {"phase": phase, "poses_per_s": self.poses_per_s}
+            make = partial(Walker, self._places, emitters, **pace, sways=self._sways)
             _, walker = await loop.create_connection(make, "127.0.0.1", self._port)
             self.walkers.append(walker)
             await asyncio.wait_for(walker.sounds, _PATIENCE_S)

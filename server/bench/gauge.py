@@ -1,28 +1,34 @@
 """Measures latencies inside a server: from when the application receives a pose until it has passed the socket the
-first audio block with that pose or a newer one.
+first audio block with that pose or a newer one. A pose that is not answered when the measurement ends counts with its
+wait so far, as soon as that is among the longest: what never comes is not left out.
 
 `/bench/begin` starts a measurement of the open streams, and `/bench/report` returns the results since then.
 `/bench/blocks` returns only the numbers of blocks, which takes hardly any time. `/bench/settled` says whether the
 server has finished its one-time work after the start.
 """
 
+import asyncio
 import json
+import os
 import struct
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.connection import StreamHost
 from server.api.web_socket import watched
+from server.bench.meter import Meter, Spent, Thread
 from server.core.durations import DurationHistogram
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
 from server.protocol.server_messages import Durations
+from server.streaming.quality_steps import QualityStep
 from server.streaming.stream import Stream
 
 POSE_ID = struct.Struct("<4xI")
@@ -30,20 +36,56 @@ POSE_ID = struct.Struct("<4xI")
 POSE_IDS = struct.Struct("<16xII")
 """The two pose ids in an audio block: of the direct sound and of the impulse responses."""
 
+_LOOK_EVERY_S = 0.1
+"""Time between looks at the quality of all streams. It changes at most four times a second."""
+
 
 @dataclass
 class Waiting:
-    """Latencies of poses: the time of each until a block with that pose or a newer one."""
+    """Latencies of poses: the time of each until a block with that pose or a newer one. A pose that a newer one
+    overtakes goes on waiting from its own arrival."""
 
     times: DurationHistogram = field(default_factory=DurationHistogram)
+    longest_s: float = 0.0
+    """The longest time of a pose that was answered."""
     _since_s: deque[tuple[int, float]] = field(default_factory=deque)
+
+    def begin(self) -> None:
+        """Forget the times so far. Poses that wait go on waiting."""
+        self.times, self.longest_s = DurationHistogram(), 0.0
 
     def enter(self, pose_id: int, now_s: float) -> None:
         self._since_s.append((pose_id, now_s))
 
     def leave(self, pose_id: int, now_s: float) -> None:
         while self._since_s and self._since_s[0][0] <= pose_id:
-            self.times.add(now_s - self._since_s.popleft()[1])
+            waited_s = now_s - self._since_s.popleft()[1]
+            self.longest_s = max(self.longest_s, waited_s)
+            self.times.add(waited_s)
+
+    def unanswered_s(self, now_s: float) -> list[float]:
+        """How long each pose has waited that is not answered, the longest first."""
+        return [now_s - since_s for _, since_s in self._since_s]
+
+
+def latencies(waits: Iterable[Waiting], now_s: float) -> dict[str, float | None]:
+    """Quantiles in milliseconds of all waits together, with the longest (`longest`) and the number of poses that were
+    answered.
+
+    A pose without an answer counts with its wait so far if that is longer than 99 % of the answered ones; a shorter
+    wait says nothing yet.
+    """
+    waits = list(waits)
+    times = DurationHistogram()
+    for waiting in waits:
+        times.merge(waiting.times)
+    answered, (p99_s,) = times.count, times.quantiles_s(0.99)
+    unanswered_s = [wait_s for waiting in waits for wait_s in waiting.unanswered_s(now_s)]
+    for wait_s in unanswered_s:
+        if p99_s is None or wait_s > p99_s:
+            times.add(wait_s)
+    longest_s = max([*unanswered_s, *(waiting.longest_s for waiting in waits)], default=0.0)
+    return {**Durations.of(times).model_dump(), "longest": 1000 * longest_s, "answered": answered}
 
 
 class _Watch:
@@ -75,15 +117,25 @@ class _Counts:
 
 
 class Gauge:
-    """An ASGI application around the server's. Everything runs on its event loop."""
+    """An ASGI application around the server's. Everything runs on its event loop. With a `meter`, reports say what each
+    part of the work cost."""
 
-    def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, app: ASGIApp, *, time_s: Callable[[], float] = time.monotonic, meter: Meter | None = None
+    ) -> None:
         self._app = app
         self._time_s = time_s
+        self._meter = meter
+        self._began_spent: dict[tuple[Thread, str], Spent] = {}
         self._watches: set[_Watch] = set()
         self._counts: list[_Counts] = []
         self._began_s = self._began_cpu_s = 0.0
         self._began_thread_cpu_s: dict[threading.Thread, float] = {}
+        self._received = 0
+        """Messages of clients."""
+        self._looks = self._below_best = 0
+        """Looks at the quality of streams, and those that found it below the best of their ladder."""
+        self._next_look: asyncio.TimerHandle | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         match scope["type"], scope.get("path"):
@@ -106,6 +158,7 @@ class Gauge:
         watch = _Watch()
 
         def see_pose(data: str | bytes) -> None:
+            self._received += 1
             if isinstance(data, bytes) and data and data[0] == ListenerPose.KIND:
                 (pose_id,) = POSE_ID.unpack_from(data)
                 now_s = self._time_s()
@@ -114,7 +167,7 @@ class Gauge:
 
         async def receive_pose() -> Message:
             message = await receive()
-            see_pose(message.get("bytes") or b"")
+            see_pose(message.get("bytes") or message.get("text") or b"")
             return message
 
         def see_blocks(messages: Sequence[bytes]) -> None:
@@ -139,7 +192,15 @@ class Gauge:
     def _begin(self, host: StreamHost) -> None:
         self._counts = [_Counts(stream) for stream in host.audio.streams]
         for watch in self._watches:
-            watch.direct.times, watch.reverberation.times = DurationHistogram(), DurationHistogram()
+            watch.direct.begin()
+            watch.reverberation.begin()
+        self._looks = self._below_best = 0
+        if self._next_look is not None:
+            self._next_look.cancel()
+        self._look_again()
+        self._received = 0
+        if self._meter is not None:
+            self._began_spent = self._meter.spent()
         self._began_s, self._began_cpu_s = self._time_s(), time.process_time()
         self._began_thread_cpu_s = {thread: _thread_cpu_s(thread) for thread in threading.enumerate()}
 
@@ -161,17 +222,45 @@ class Gauge:
 
     def _report(self) -> dict[str, Any]:
         blocks = self._count_blocks()
-        duration_s = blocks["duration_s"]
+        duration_s, now_s = blocks["duration_s"], self._time_s()
+        self._look_at_quality()
         return {
             **blocks,
             "block_ms": merged(counts.stream.times.render for counts in self._counts),
             "lateness_ms": merged(counts.stream.times.lateness for counts in self._counts),
             "ir_ms": merged(counts.stream.times.response for counts in self._counts),
-            "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
-            "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
+            "pose_to_audio_ms": latencies([watch.direct for watch in self._watches], now_s),
+            "pose_to_reverberation_ms": latencies([watch.reverberation for watch in self._watches], now_s),
+            "behind_s": [max(watch.reverberation.unanswered_s(now_s), default=0.0) for watch in self._watches],
+            "quality_at_end": Counter(_describe(counts.stream.session.quality) for counts in self._counts),
+            "below_best_share": self._below_best / self._looks if self._looks else 0.0,
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
             "server_load_by_thread": self._loads_by_thread(duration_s),
+            "messages": self._received,
+            "resident_bytes": resident_bytes(),
+            **self._parts(),
         }
+
+    def _parts(self) -> dict[str, Any]:
+        """What each part of the work has cost since the beginning."""
+        if self._meter is None:
+            return {}
+        parts = []
+        for (thread, part), now in self._meter.spent().items():
+            before = self._began_spent.get((thread, part), Spent())
+            calls = now.calls - before.calls
+            spent = {"cpu_s": now.cpu_s - before.cpu_s, "calls": calls, "units": now.units - before.units}
+            parts.append({"thread": thread, "part": part, **spent})
+        return {"parts": parts, "meter_call_s": self._meter.cost_s()}
+
+    def _look_again(self) -> None:
+        self._look_at_quality()
+        self._next_look = asyncio.get_running_loop().call_later(_LOOK_EVERY_S, self._look_again)
+
+    def _look_at_quality(self) -> None:
+        streams = [counts.stream for counts in self._counts]
+        self._looks += len(streams)
+        self._below_best += sum(stream.session.quality != stream.ladder.steps[0] for stream in streams)
 
     def _loads_by_thread(self, duration_s: float) -> dict[str, float]:
         """CPU load by name, of the threads that exist since the beginning."""
@@ -182,9 +271,21 @@ class Gauge:
         }
 
 
+def _describe(quality: QualityStep) -> str:
+    """A quality step in words, such as "standard, 5 responses a second"."""
+    rate = "" if quality.ir_rate_hz is None else f", {quality.ir_rate_hz:g} responses a second"
+    return f"{quality.level}{rate}{', shared tail' if quality.shared_tail else ''}"
+
+
 def _thread_cpu_s(thread: threading.Thread) -> float:
     assert thread.ident is not None
     return time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+
+
+def resident_bytes() -> int | None:
+    """Memory of this process that is in use now; None where the system does not say."""
+    status = Path("/proc/self/statm")
+    return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if status.exists() else None
 
 
 def merged(histograms: Iterable[DurationHistogram]) -> dict[str, float | None]:

@@ -51,6 +51,12 @@ def instruction_set(features: str | None = None) -> str:
     return next((name for feature, name in _INSTRUCTION_SETS.items() if feature in usable), platform.machine())
 
 
+def has_wide_vectors(instructions: str | None = None) -> bool:
+    """Whether the goals of AVX-512 hold for these instructions, by default for this processor's, and not those of
+    AVX2."""
+    return (instructions or instruction_set()) == "AVX-512"
+
+
 def _version(distribution: str) -> str | None:
     try:
         return version(distribution)

@@ -19,9 +19,9 @@ class Goal:
     stretch: float | None = None
     is_at_most: bool = False
 
-    def judge(self, value: float | None, *, failure: str | None = None) -> "Judgement":
+    def judge(self, value: float | None, *, failure: str | None = None, note: str | None = None) -> "Judgement":
         """Compare `value` with the goal. The goal is not reached if `failure` says why the run did not pass, if the
-        value is None because it could not be measured, or if it is NaN."""
+        value is None because it could not be measured, or if it is NaN. A `note` says what else the value cost."""
         reached: Reached | None = None
         if failure is None and value is not None:
             if self._is_met(value, self.limit):
@@ -29,7 +29,7 @@ class Goal:
             if self.stretch is not None and self._is_met(value, self.stretch):
                 reached = "stretch"
         reason = failure if failure is not None or reached is not None else self._missed(value)
-        return Judgement(self.measure, value, self.limit, self.stretch, self.is_at_most, reached, reason)
+        return Judgement(self.measure, value, self.limit, self.stretch, self.is_at_most, reached, reason, note=note)
 
     def skip(self, reason: str) -> "Judgement":
         """The judgement of a goal that this run does not cover."""
@@ -56,6 +56,8 @@ class Judgement:
     reached: Reached | None
     reason: str | None
     is_skipped: bool = False
+    note: str | None = None
+    """What has to be known of the run besides, whether the goal was reached or not."""
 
     @property
     def is_missed(self) -> bool:
@@ -115,7 +117,7 @@ def _row(judgement: Judgement) -> dict[str, object]:
         "goal": f"{sign} {show(judgement.limit)}",
         "stretch": None if judgement.stretch is None else f"{sign} {show(judgement.stretch)}",
         "reached": judgement.reached or ("skipped" if judgement.is_skipped else "no"),
-        "why": judgement.reason,
+        "why": "; ".join(text for text in (judgement.reason, judgement.note) if text) or None,
     }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from server.acoustics.geometry import Pose
-from server.bench.machine import instruction_set
+from server.bench.machine import has_wide_vectors
 from server.bench.report import Goal, Judgement
 from server.field.field import AcousticField
 from server.rendering.hrtf import HeadFilters, kemar
@@ -58,7 +58,7 @@ def judge(
     rows: Sequence[dict[str, Any]], *, knows_directions: bool, instructions: str | None = None
 ) -> list[Judgement]:
     """Compare rows with the goals of a processor with these `instructions`, by default this one's."""
-    is_wide = (instructions or instruction_set()) == "AVX-512"
+    is_wide = has_wide_vectors(instructions)
     moved = Goal("ms_p50 of a moved pose", 0.15 if is_wide else 0.25, 0.07 if is_wide else 0.12, is_at_most=True)
     turned = Goal("ms_p50 of a head that only turned", 0.05, is_at_most=True)
     ms_p50 = {row["name"]: row["ms_p50"] for row in rows}

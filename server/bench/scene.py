@@ -1,5 +1,10 @@
-"""A scene whose field takes hardly any time, so that benchmarks measure rendering. It is an L-shaped room. Its impulse
-responses (IRs), a second long at 48 kHz, come from a small bank, selected by the poses of listener and emitter."""
+"""Scenes of benchmarks of streams: any scene bundle, and a scene of our own whose field takes hardly any time, so that
+benchmarks measure rendering alone.
+
+That scene, `bench`, is an L-shaped room. Its impulse responses (IRs), a second long at 48 kHz, come from a small bank,
+selected by the poses of listener and emitter. Rendering is harder there than in most scenes, and computing a response
+far easier than in any.
+"""
 
 from pathlib import Path
 
@@ -11,9 +16,10 @@ from server.acoustics.geometry import yaws_of
 from server.acoustics.sound_path import SoundPathFinder
 from server.bench.rooms import FloatArray, room
 from server.field.field import AcousticField
+from server.field.fields_by_level import FieldsByLevel
 from server.kernels.array_pool import ArrayPool
 from server.rendering.hrtf import HeadFilters
-from server.scene.bundle import Bundle
+from server.scene.bundle import Bundle, find_bundle
 from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import ARRAYS_FILE, Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Start
 
@@ -49,17 +55,25 @@ _MANIFEST = Manifest(
 )
 
 
+def bundle_of(scene: str) -> Bundle:
+    """The bundle of `bench`, of a bundled scene by its id, or of any scene by its folder. Raises RequestError
+    `unknown_scene`, and BundleError for a damaged bundle."""
+    if scene != SCENE:
+        return Bundle.load(find_bundle(scene))
+    noise = np.zeros((2, _SAMPLES), np.float32)
+    return Bundle(folder=Path(), manifest=_MANIFEST, digest="", models={}, frozen_noise=noise)
+
+
+def levels_of(scene: str) -> FieldsByLevel:
+    """The quality levels of a scene, named as for `bundle_of`."""
+    return FieldsByLevel([BankField()]) if scene == SCENE else FieldsByLevel.load(bundle_of(scene))
+
+
 class BankField(AcousticField):
     """A field that looks IRs up instead of computing them. The IR changes every two centimetres."""
 
     def __init__(self) -> None:
-        self.bundle = Bundle(
-            folder=Path(),
-            manifest=_MANIFEST,
-            digest="",
-            models={},
-            frozen_noise=np.zeros((2, _SAMPLES), np.float32),
-        )
+        self.bundle = bundle_of(SCENE)
         self.level = _MANIFEST.levels[0]
         self._paths = SoundPathFinder(self.bundle.floor_plan, _MANIFEST.speed_of_sound)
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])

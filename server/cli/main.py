@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from server.bench import cli as bench
+from server.bench.capacity_cli import plan_capacity
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
 from server.core.errors import NafirError, RequestError
 from server.health.cli import check
@@ -41,6 +42,7 @@ app = StrictTyper(
     rich_markup_mode="rich",
 )
 app.add_typer(bench.app, name="bench")
+app.command()(plan_capacity)
 app.command()(check)
 app.command()(soak)
 app.command()(listening_test)

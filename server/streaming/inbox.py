@@ -41,23 +41,23 @@ class Inbox:
 
     def put_message(self, message: ClientMessage, now_s: float) -> bool:
         """Queue a message; return False, and refuse it, if too many are waiting. A listener's pose replaces an older
-        one directly before it."""
-        if not self._replace_pose(message, now_s):
+        one directly before it, and counts from when that one arrived: the listener has waited since then."""
+        if not self._replace_pose(message):
             if len(self._messages) >= MAX_WAITING_MESSAGES:
                 return False
             self._messages.append((now_s, message))
         self.brings_emitter |= isinstance(message, AddEmitter)
         return True
 
-    def _replace_pose(self, message: ClientMessage, now_s: float) -> bool:
+    def _replace_pose(self, message: ClientMessage) -> bool:
         if not (isinstance(message, ListenerPose) and self._messages):
             return False
         try:
-            _, last = self._messages[-1]
+            arrived_s, last = self._messages[-1]
             if not (isinstance(last, ListenerPose) and last.pose_id < message.pose_id):
                 return False
             # Only this method appends: if the audio thread has taken the last message meanwhile, the queue is empty.
-            self._messages[-1] = now_s, message
+            self._messages[-1] = arrived_s, message
         except IndexError:
             return False
         return True

@@ -4,16 +4,22 @@ from collections import deque
 
 from server.core.durations import DurationHistogram
 
+_MOST_WAITING = 1024
+"""Poses of a stream that may wait: half a minute of them."""
+
 
 class PoseTimes:
     """Durations from a pose's arrival to the first block that uses it or a newer one."""
 
     def __init__(self) -> None:
         self.durations = DurationHistogram()
-        # If a field fails, poses never take effect; the oldest are dropped.
-        self._waiting: deque[tuple[int, float]] = deque(maxlen=1024)
+        self._waiting: deque[tuple[int, float]] = deque()
 
     def arrive(self, pose_id: int, now_s: float) -> None:
+        if len(self._waiting) == _MOST_WAITING:
+            # If a field fails, poses never take effect. The oldest counts with its wait so far, or waits would look
+            # the better the more poses never take effect.
+            self.durations.add(now_s - self._waiting.popleft()[1])
         self._waiting.append((pose_id, now_s))
 
     def take_effect(self, pose_id: int, now_s: float) -> None:

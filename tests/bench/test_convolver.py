@@ -132,6 +132,15 @@ def cases(one=None, sixteen=None):
     return {**FINE, "cases": [case_of(1, **(one or {})), case_of(16, **(sixteen or {}))]}
 
 
+@pytest.mark.parametrize(
+    ("instructions", "limits"), [("AVX-512", [(15, 27), (40, 77)]), ("AVX2", [(18, 27), (60, 77)])]
+)
+def test_every_processor_has_its_goals(instructions, limits):
+    assert [(goal.limit, goal.stretch) for goal in convolver.ratio_goals(instructions)] == limits
+    of_run = [each for each in convolver.judge(FINE, instructions) if "pedalboard" in each.measure]
+    assert [(each.limit, each.stretch) for each in of_run] == limits
+
+
 def missed_of(measured):
     return [judgement.measure.partition(",")[0] for judgement in convolver.judge(measured) if judgement.is_missed]
 

@@ -1,5 +1,6 @@
 """The small WebSocket client, against the library's own parser and serialiser."""
 
+import asyncio
 import itertools
 
 import numpy as np
@@ -7,10 +8,12 @@ import pytest
 from websockets.frames import Frame, Opcode
 from websockets.streams import StreamReader
 
-from server.bench.crowd import FrameReader, frame
+from server.bench.crowd import FrameReader, Walker, frame
 from server.bench.gauge import POSE_ID, POSE_IDS
+from server.bench.places import Places
+from server.bench.scene import bundle_of
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import ListenerPose
+from server.protocol.client_messages import AddEmitter, Hello, ListenerPose, MoveEmitter, parse_client_message
 
 LENGTHS = (0, 1, 125, 126, 127, 2_076, 65_535)
 
@@ -48,3 +51,57 @@ def test_pose_ids_stand_where_they_are_looked_for():
     assert POSE_IDS.unpack_from(block.serialize("f32")) == (3, 4)
     pose = ListenerPose(pose_id=5, position=(1.0, 2.0, 3.0))
     assert POSE_ID.unpack_from(pose.serialize_binary()) == (5,)
+
+
+class Transport:
+    """Keeps what a client sends, as a server reads it."""
+
+    def __init__(self):
+        self.messages = []
+
+    def is_closing(self):
+        return False
+
+    def write(self, data):
+        reader = StreamReader()
+        reader.feed_data(data)
+        parsing = Frame.parse(reader.read_exact, mask=True)
+        with pytest.raises(StopIteration) as parsed:
+            next(parsing)
+        read = parsed.value.value
+        text = read.data.decode() if read.opcode is Opcode.TEXT else read.data
+        self.messages.append(parse_client_message(text))
+
+    def abort(self):
+        pass
+
+
+@pytest.mark.parametrize("sways", [False, True])
+def test_emitters_move_with_their_listener_if_they_are_to(sways):
+    places = Places.of(bundle_of("apartment"))
+    emitters = places.emitters(3, np.random.default_rng(0))
+
+    async def scenario():
+        walker = Walker(places, emitters, phase=0.25, poses_per_s=30.0, sways=sways)
+        walker._transport = transport = Transport()
+        walker._begin()
+        for _ in range(4):
+            walker._next_pose.cancel()  # not when it would be time
+            walker._walk()
+        walker.close()
+        return transport.messages, walker.poses.unanswered_s(0.0), walker.reverberation.unanswered_s(0.0)
+
+    messages, direct, reverberation = asyncio.run(scenario())
+    hello, *adds = messages[:4]
+    assert isinstance(hello, Hello)
+    assert hello.scene == "apartment"
+    assert [isinstance(message, AddEmitter) for message in adds] == [True] * 3
+    moved = messages[4:]
+    expected = [*[MoveEmitter] * 3 * sways, ListenerPose] * 4
+    assert [type(message) for message in moved] == expected
+    ids = [message.pose_id for message in moved]
+    assert ids == sorted(set(ids))
+    assert len(direct) == len(reverberation) == 4  # a wait for each pose of the listener
+    for message in (*adds, *moved):
+        places.bundle.require_inside(message.position, "position")
+    assert len({message.position for message in moved}) > 4 * sways

@@ -7,9 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from server.bench.gauge import Gauge, Waiting
+from server.bench import gauge as gauges
+from server.bench.gauge import Gauge, Waiting, latencies
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
+from server.streaming.load_policy import Ladder
+from server.streaming.quality_steps import QualityStep
 from server.streaming.stream_times import StreamTimes
 
 
@@ -54,6 +57,56 @@ def test_a_pose_is_followed_by_the_first_block_that_is_not_older():
     waiting.leave(3, 0.040)
     waiting.leave(3, 0.050)
     assert waiting.times.count == 3
+
+
+def test_a_pose_that_newer_ones_overtake_counts_from_its_own_arrival():
+    waiting = Waiting()
+    for number in range(100):
+        waiting.enter(number, number * 0.01)
+    waiting.leave(99, 1.0)
+    assert waiting.times.count == 100
+    assert waiting.times.quantiles_s(1) == [pytest.approx(1.0, rel=0.03)]
+    assert waiting.longest_s == pytest.approx(1.0)
+
+
+def stream_of_poses(answered, seconds=60, every_s=1 / 32):
+    """Waits of a listener whose first `answered` poses were each answered after 10 ms, at the end of all."""
+    waiting = Waiting()
+    for number in range(round(seconds / every_s)):
+        waiting.enter(number, number * every_s)
+        if number < answered:
+            waiting.leave(number, number * every_s + 0.010)
+    return waiting
+
+
+def test_poses_that_were_never_answered_are_not_left_out():
+    fine, stuck = stream_of_poses(answered=60 * 32), stream_of_poses(answered=0)
+    of_fine = latencies([fine] * 9, 60.0)
+    assert of_fine["p99"] == pytest.approx(10, rel=0.03)
+    assert of_fine["longest"] == pytest.approx(10)
+    of_both = latencies([fine] * 9 + [stuck], 60.0)
+    assert of_both["p50"] == pytest.approx(10, rel=0.03)
+    assert of_both["p99"] > 50_000
+    assert of_both["longest"] == pytest.approx(60_000)
+    assert of_both["answered"] == 9 * 60 * 32
+    of_stuck = latencies([stuck], 60.0)
+    assert of_stuck["p50"] == pytest.approx(30_000, rel=0.05)
+    assert of_stuck["answered"] == 0
+
+
+def test_a_pose_that_has_only_just_arrived_says_nothing_yet():
+    waiting = stream_of_poses(answered=60 * 32)
+    before = latencies([waiting], 60.0)
+    waiting.enter(10_000, 60.0)
+    assert latencies([waiting], 60.001) == before
+
+
+def test_a_wait_that_began_before_a_measurement_goes_on_in_it():
+    waiting = Waiting()
+    waiting.enter(1, 0.0)
+    waiting.begin()
+    waiting.leave(1, 7.0)
+    assert waiting.times.quantiles_s(1) == [pytest.approx(7.0, rel=0.03)]
 
 
 @pytest.mark.parametrize(("measured", "is_settled"), [((), False), (("flat",), False), (("flat", "bench"), True)])
@@ -123,9 +176,13 @@ class Window:
     sent = 1_000
 
 
+BEST, LESS = QualityStep("standard", None, False, 1.0), QualityStep("standard", 5.0, False, 1.0)
+
+
 class Session:
     window = Window()
     blocks_dropped = 5
+    quality = BEST
 
 
 class Stream:
@@ -135,6 +192,7 @@ class Stream:
 
     def __init__(self):
         self.session = Session()
+        self.ladder = Ladder((BEST, LESS))
         self.blocks_late = 7
         self.times = StreamTimes()
 
@@ -160,3 +218,25 @@ def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_on
     assert len(blocks) == 6
     assert report["block_ms"]["p50"] == pytest.approx(2, rel=0.03)
     assert report["lateness_ms"]["p50"] is None
+    assert report["quality_at_end"] == {"standard": 1}
+    assert report["below_best_share"] == 0
+
+
+def test_the_share_of_time_at_less_than_the_best_quality_is_told(monkeypatch):
+    streams = Stream(), Stream()
+    monkeypatch.setattr(Audio, "streams", streams)
+    monkeypatch.setattr(gauges, "_LOOK_EVERY_S", 0.001)
+    gauge = Gauge(None)
+
+    async def scenario():
+        await ask(gauge, "/bench/begin")
+        await asyncio.sleep(0.02)
+        assert (await ask(gauge, "/bench/report"))["below_best_share"] == 0
+        streams[0].session.quality = LESS
+        await ask(gauge, "/bench/begin")
+        await asyncio.sleep(0.02)
+        return await ask(gauge, "/bench/report")
+
+    report = asyncio.run(scenario())
+    assert report["below_best_share"] == 0.5
+    assert report["quality_at_end"] == {"standard": 1, "standard, 5 responses a second": 1}

@@ -1,6 +1,8 @@
 import numpy as np
+import pytest
 
-from server.bench.scene import IR_S, SAMPLE_RATE, BankField
+from server.bench.scene import IR_S, SAMPLE_RATE, SCENE, BankField, bundle_of, levels_of
+from server.core.errors import RequestError
 
 
 def test_the_bank_answers_like_a_field_and_differs_from_place_to_place():
@@ -16,3 +18,11 @@ def test_the_bank_answers_like_a_field_and_differs_from_place_to_place():
     np.testing.assert_array_equal(irs[:1], field.impulse_responses(listeners[:1], emitters[:1], [0.0]))
     for position in (*listeners[::50], emitters[0], field.bundle.manifest.start.listener):
         field.bundle.require_inside(tuple(position), "position")
+
+
+def test_a_scene_of_streams_is_that_of_the_bank_or_any_bundle(bundle):
+    assert levels_of(SCENE).bundle.id == bundle_of(SCENE).id == SCENE
+    assert bundle_of(str(bundle.folder)).digest == levels_of(str(bundle.folder)).bundle.digest == bundle.digest
+    assert bundle_of("apartment").id == "apartment"
+    with pytest.raises(RequestError, match="'atlantis' is neither"):
+        bundle_of("atlantis")

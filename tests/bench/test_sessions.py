@@ -7,9 +7,14 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from server.bench import machine
 from server.bench import sessions as bench
 from server.bench.cli import app
+from server.bench.crowd import Crowd
+from server.bench.places import Places
+from server.bench.scene import bundle_of
 from server.bench.sessions import Plan, failures, find_most, judge, measure_sessions
+from server.core.errors import RequestError
 
 pytestmark = pytest.mark.timed
 
@@ -30,11 +35,19 @@ def test_the_most_is_found_to_within_five_percent(capacity):
     assert len(set(tried)) == len(tried)
 
 
+SCENE = "flat"
+
+
+def followed(p99, answered=1_800):
+    return {"p99": p99, "longest": p99, "answered": answered}
+
+
 def run_of(sessions, **changes):
     """What a run of a minute finds that passes."""
     return {
         "sessions": sessions,
         "streams": sessions,
+        "duration_s": 60.1,
         "late_share": 0.0,
         "errors": [],
         "blocks_sent": 11_250 * sessions,
@@ -42,26 +55,91 @@ def run_of(sessions, **changes):
         "blocks_late": 0,
         "blocks_missing": 0,
         "poses_per_s": 30.0,
-        "pose_to_audio_ms": {"p99": 7.0},
+        "pose_to_audio_ms": followed(5.0),
+        "pose_to_reverberation_ms": followed(90.0),
+        "behind_s": [0.02] * sessions,
+        "quality_at_end": {"standard": sessions},
+        "below_best_share": 0.0,
         **changes,
     }
 
 
 def case_of(emitters, sessions, **changes):
-    return {"emitters": emitters, "is_given": False, **run_of(sessions, **changes)}
+    return {"scene": SCENE, "emitters": emitters, "is_given": False, **run_of(sessions, **changes)}
 
 
-def test_the_goals_are_for_sixteen_emitters():
-    cases = [case_of(1, 90), case_of(16, 21, pose_to_audio_ms={"p99": 15.5})]
-    assert [judgement.reached for judgement in judge(cases)] == ["goal", None]
-    assert [judgement.is_skipped for judgement in judge(cases)] == [False, False]
-    assert [judgement.is_skipped for judgement in judge(cases[:1])] == [True, True]
+def judged(*cases, instructions="AVX2"):
+    """The judgements by the part of the measure that tells them apart."""
+    short = {
+        "sessions per core, 16 emitters": "sixteen",
+        "sessions per core, 1 emitter": "one",
+        "pose to audio": "audio",
+        "pose to reverberation": "reverberation",
+    }
+    judgements = judge(list(cases), instructions)
+    named = {}
+    for judgement in judgements:
+        (name,) = (name for part, name in short.items() if part in judgement.measure)
+        assert judgement.measure.startswith(f"{cases[0]['scene']}: ")
+        named[name] = judgement
+    assert len(named) == len(judgements)
+    return named
+
+
+@pytest.mark.parametrize(
+    ("instructions", "sixteen", "one", "audio_ms", "reverberation_ms"),
+    [
+        ("AVX2", (20, 40), (80, 120), (12, 8), (250, 100)),
+        ("NEON", (20, 40), (80, 120), (12, 8), (250, 100)),
+        ("AVX-512", (40, 80), (120, 200), (8, 6), (250, 100)),
+    ],
+)
+def test_every_processor_has_its_goals(instructions, sixteen, one, audio_ms, reverberation_ms):
+    goals = judged(case_of(16, 20), instructions=instructions)
+    limits = {name: (judgement.limit, judgement.stretch) for name, judgement in goals.items()}
+    assert limits == {"sixteen": sixteen, "one": one, "audio": audio_ms, "reverberation": reverberation_ms}
+    assert [goals[name].is_at_most for name in limits] == [False, False, True, True]
+
+
+def test_a_goal_is_judged_by_the_case_that_it_is_for():
+    goals = judged(case_of(1, 90), case_of(16, 21, pose_to_audio_ms=followed(15.5)))
+    assert {name: each.reached for name, each in goals.items()} == {
+        "sixteen": "goal",
+        "one": "goal",
+        "audio": None,
+        "reverberation": "stretch",
+    }
+    only_one, only_sixteen = judged(case_of(1, 90)), judged(case_of(16, 90))
+    assert [name for name, each in only_one.items() if each.is_skipped] == ["sixteen", "audio", "reverberation"]
+    assert [name for name, each in only_sixteen.items() if each.is_skipped] == ["one"]
+
+
+def test_every_scene_is_judged_apart():
+    cases = [case_of(16, 20), {**case_of(16, 8), "scene": "bench"}]
+    reached = {
+        each.measure.partition(",")[0]: each.reached for each in judge(cases, "AVX2") if "16 emitters" in each.measure
+    }
+    assert reached["flat: sessions per core"] == "goal"
+    assert reached["bench: sessions per core"] is None
+    assert len(judge(cases, "AVX2")) == 8
 
 
 def test_poses_are_judged_with_the_goals_number_of_sessions_where_there_can_be_more():
-    case = case_of(16, 33, pose_to_audio_ms={"p99": 43.0})
-    assert [judgement.value for judgement in judge([case])] == [33, 43.0]
-    assert [judgement.value for judgement in judge([{**case, "with_20_sessions": run_of(20)}])] == [33, 7.0]
+    case = case_of(16, 33, pose_to_audio_ms=followed(43.0), pose_to_reverberation_ms=followed(900.0))
+    alone, beside = judged(case), judged({**case, "with_20_sessions": run_of(20)})
+    assert [alone[name].value for name in ("sixteen", "audio", "reverberation")] == [33, 43.0, 900.0]
+    assert [beside[name].value for name in ("sixteen", "audio", "reverberation")] == [33, 5.0, 90.0]
+
+
+def test_poses_of_fewer_sessions_than_the_goals_reach_nothing():
+    """Eight sessions follow their poses soon, and say nothing of twenty."""
+    found, given = judged(case_of(16, 8)), judged({**case_of(16, 8), "is_given": True})
+    for name in ("audio", "reverberation"):
+        assert found[name].is_missed
+        assert "no more than 8 sessions passed" in found[name].reason
+        assert given[name].is_skipped
+    assert found["sixteen"].is_missed
+    assert given["sixteen"].is_skipped
 
 
 TIMED_OUT = {"sessions": 20, "late_share": 1.0, "errors": ["TimeoutError"]}
@@ -75,46 +153,73 @@ FAILED = {
     "a client lost its stream": (run_of(20, streams=19), "only 19 of 20 sessions had a stream"),
     "nobody was sent a block": (run_of(20, blocks_sent=0, blocks_heard=0), "sent no block"),
     "clients heard half of it": (run_of(20, blocks_heard=112_500), "heard 112500 of 225000"),
-    "no pose was followed": (run_of(20, pose_to_audio_ms={"p99": None}), "no pose"),
+    "no pose was followed": (run_of(20, pose_to_audio_ms=followed(60_000.0, 0)), "no pose"),
+    "no reverberation followed": (run_of(20, pose_to_reverberation_ms=followed(60_000.0, 0)), "by reverberation"),
+    "one reverberation stood still": (run_of(20, behind_s=[0.1] * 19 + [31.0]), "stood still, for 31 s"),
 }
 
 
 @pytest.mark.parametrize(("run", "reason"), FAILED.values(), ids=FAILED.keys())
 @pytest.mark.parametrize("is_given", [True, False])
 def test_a_run_that_failed_reaches_no_goal_and_the_reason_is_told(run, reason, is_given):
-    case = {"emitters": 16, "is_given": is_given, **run}
-    for judgement in judge([case]):
+    case = {"scene": SCENE, "emitters": 16, "is_given": is_given, **run}
+    for name, judgement in judged(case).items():
         assert judgement.reached is None
-        assert judgement.is_missed
-        assert reason in judgement.reason
+        assert judgement.is_missed == (name != "one")
+        assert reason in judgement.reason or name == "one"
     (told,) = failures([case])
     assert reason in told
 
 
+@pytest.mark.parametrize("run", [run for run, _ in FAILED.values()], ids=FAILED.keys())
+def test_a_run_of_one_emitter_that_failed_reaches_no_goal(run):
+    judgement = judged({"scene": SCENE, "emitters": 1, "is_given": True, **run, "sessions": 200})["one"]
+    assert judgement.is_missed
+    assert judgement.reached is None
+    assert judgement.reason
+
+
 @pytest.mark.parametrize(("run", "reason"), FAILED.values(), ids=FAILED.keys())
 def test_poses_of_a_failed_run_at_the_goals_number_of_sessions_reach_nothing(run, reason):
-    sessions, poses = judge([{**case_of(16, 33), "with_20_sessions": run}])
-    assert sessions.reached == "goal"
-    assert poses.reached is None
-    assert reason in poses.reason
+    goals = judged({**case_of(16, 33), "with_20_sessions": run})
+    assert goals["sixteen"].reached == "goal"
+    for name in ("audio", "reverberation"):
+        assert goals[name].reached is None
+        assert reason in goals[name].reason
 
 
 def test_a_run_that_passed_reaches_its_goals():
-    assert [judgement.reached for judgement in judge([case_of(16, 20)])] == ["goal", "stretch"]
+    reached = {name: each.reached for name, each in judged(case_of(16, 20)).items()}
+    assert reached == {"sixteen": "goal", "one": None, "audio": "stretch", "reverberation": "stretch"}
     assert failures([case_of(16, 20), case_of(1, 3)]) == []
 
 
-def test_fewer_sessions_than_the_goals_decide_nothing_where_no_more_were_asked_for():
-    asked_for = {**case_of(16, 8), "is_given": True}
-    assert [judgement.is_skipped for judgement in judge([asked_for])] == [True, False]
-    assert judge([case_of(16, 8)])[0].is_missed
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"poses_per_s": 0, "pose_to_audio_ms": followed(None, 0)}, "nobody moves"),
+        ({"poses_per_s": 10}, "30 poses a second"),
+        ({"duration_s": 8.0}, "this run took 8"),
+    ],
+)
+def test_an_easier_run_than_the_goals_neither_reaches_nor_misses_them(changes, reason):
+    for name, judgement in judged(case_of(16, 40, **changes)).items():
+        assert judgement.is_skipped
+        assert reason in judgement.reason or name == "one"
+    assert failures([case_of(16, 40, **changes)]) == []
 
 
-def test_listeners_who_stand_still_say_nothing_of_poses():
-    still = case_of(16, 20, poses_per_s=0, pose_to_audio_ms={"p99": None})
-    sessions, poses = judge([still])
-    assert sessions.reached == "goal"
-    assert poses.is_skipped
+def test_an_easy_run_that_failed_is_told_all_the_same():
+    assert judged(case_of(16, 40, duration_s=8.0, late_share=0.5))["sixteen"].is_missed
+
+
+def test_a_goal_reached_at_less_than_the_best_quality_says_so():
+    eased = case_of(16, 20, below_best_share=0.34, quality_at_end={"standard": 12, "standard, 5 responses a second": 8})
+    for name in ("sixteen", "audio", "reverberation"):
+        note = judged(eased)[name].note
+        assert "34%" in note
+        assert "12 at standard; 8 at standard, 5 responses a second" in note
+    assert judged(case_of(16, 20))["sixteen"].note is None
 
 
 @pytest.mark.parametrize(
@@ -124,19 +229,30 @@ def test_listeners_who_stand_still_say_nothing_of_poses():
 @pytest.mark.parametrize("form", [["--json"], []])
 def test_the_bench_ends_with_code_1_where_its_run_failed(monkeypatch, run, code, emitters, form):
     @contextlib.contextmanager
-    def serve(_core):
-        yield 1
+    def served(_core, _scene):
+        yield bench.Served(1, 0)
 
-    async def measure(_plan, _port, _advance, cases):
-        cases.append({"emitters": emitters, "is_given": True, **run, "trials": []})
+    async def measure(_plan, places, _port, _advance, cases):
+        scene = {"scene": places.bundle.id, "emitters": emitters, "is_given": True}
+        cases.append({**scene, **run, "trials": []})
 
-    monkeypatch.setattr(bench, "_serve", serve)
+    monkeypatch.setattr(machine, "instruction_set", lambda: "AVX2")
+    monkeypatch.setattr(bench, "served", served)
     monkeypatch.setattr(bench, "_measure", measure)
-    outcome = CliRunner().invoke(app, ["stream", "--emitters", str(emitters), "--sessions", "20", *form])
+    options = ["--scene", "bench", "--emitters", str(emitters), "--sessions", "20"]
+    outcome = CliRunner().invoke(app, ["stream", *options, *form])
     assert outcome.exit_code == code, outcome.output
     assert ("not reached" in outcome.stderr) == bool(code)
     if form:
-        assert json.loads(outcome.stdout)["host"]["instruction_set"]
+        measured = json.loads(outcome.stdout)
+        assert measured["host"]["instruction_set"]
+        assert [scene["id"] for scene in measured["scenes"]] == ["bench"]
+
+
+def test_a_scene_that_is_none_is_refused_by_name():
+    outcome = CliRunner().invoke(app, ["stream", "--scene", "atlantis"])
+    assert isinstance(outcome.exception, RequestError)
+    assert "'atlantis' is neither a bundled scene" in str(outcome.exception)
 
 
 class Trials:
@@ -197,8 +313,9 @@ def test_a_run_ends_once_it_has_failed(monkeypatch):
     monkeypatch.setattr(bench, "_get", get)
     monkeypatch.setattr(bench, "_SETTLE_S", 0.0)
     monkeypatch.setattr(bench, "_LOOK_EVERY_S", 0.001)
-    monkeypatch.setattr(bench.Crowd, "resize", resize)
-    trial = bench._Trial(1, 16, 30.0, lambda _: None)
+    monkeypatch.setattr(Crowd, "resize", resize)
+    places = Places.of(bundle_of("bench"))
+    trial = bench.Trial(1, Crowd(1, places, emitters=16, poses_per_s=30.0), lambda _: None)
     asyncio.run(trial.run(10, 40.0, until_failed=True))
     assert asked == ["begin", "blocks", "blocks", "report"]
 
@@ -206,24 +323,25 @@ def test_a_run_ends_once_it_has_failed(monkeypatch):
 @pytest.mark.parametrize("done", [0, 1])
 def test_what_is_interrupted_keeps_what_it_has(monkeypatch, done):
     @contextlib.contextmanager
-    def serve(_core):
-        yield 1
+    def served(_core, _scene):
+        yield bench.Served(1, 0)
 
-    async def measure(_plan, _port, _advance, cases):
+    async def measure(_plan, _places, _port, _advance, cases):
         cases += [case_of(1, 3)] * done
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench, "_serve", serve)
+    monkeypatch.setattr(bench, "served", served)
     monkeypatch.setattr(bench, "_measure", measure)
+    plan = Plan(scenes=("bench",))
     if not done:
         with pytest.raises(KeyboardInterrupt):
-            measure_sessions(Plan())
+            measure_sessions(plan)
         return
-    measured = measure_sessions(Plan())
+    measured = measure_sessions(plan)
     assert [case["emitters"] for case in measured["cases"]] == [1]
     assert not measured["is_complete"]
 
 
 def test_a_case_in_which_nothing_worked_reaches_no_goal():
-    case = {"emitters": 16, "is_given": False, "sessions": 0, "trials": []}
-    assert [judgement.is_missed for judgement in judge([case])] == [True, True]
+    case = {"scene": SCENE, "emitters": 16, "is_given": False, "sessions": 0, "trials": []}
+    assert [each.is_missed for name, each in judged(case).items() if name != "one"] == [True] * 3

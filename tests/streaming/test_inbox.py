@@ -34,11 +34,11 @@ def test_a_newer_pose_takes_the_place_of_the_one_directly_before_it(put, left):
     assert not inbox.has_messages
 
 
-def test_of_a_pose_that_was_overtaken_the_time_of_the_newer_one_counts():
+def test_a_pose_that_overtakes_another_counts_from_the_others_arrival():
     inbox = Inbox()
     inbox.put_message(pose(1), 1.0)
     inbox.put_message(pose(2), 2.0)
-    assert list(inbox.take_messages()) == [(2.0, pose(2))]
+    assert list(inbox.take_messages()) == [(1.0, pose(2))]
 
 
 def test_too_many_are_refused_but_not_what_takes_the_place_of_another():

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.streaming.stream_times import PoseTimes, ResponseWait
+from server.streaming.stream_times import _MOST_WAITING, PoseTimes, ResponseWait
 
 
 @given(st.lists(st.tuples(st.sampled_from(["calls", "rests", "comes", "restarts", "asks"]), st.integers(1, 9))))
@@ -42,3 +42,12 @@ def test_a_pose_takes_effect_with_the_first_block_that_has_it_or_a_newer_one():
     assert times.durations.total_s == pytest.approx(0.5 + 0.4)
     times.take_effect(3, 0.6)
     assert times.durations.count == 3
+
+
+def test_poses_that_never_take_effect_count_with_their_wait_so_far():
+    times, every_s = PoseTimes(), 1 / 32
+    for number in range(2 * _MOST_WAITING):
+        times.arrive(number, number * every_s)
+    assert times.durations.count == _MOST_WAITING
+    assert times.durations.quantiles_s(0.01) == [pytest.approx(_MOST_WAITING * every_s, rel=0.03)]
+    assert len(times._waiting) == _MOST_WAITING
