@@ -45,6 +45,7 @@ from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
 from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import Offer
+from server.streaming.render_costs import measure_rendering
 from server.streaming.session import Session
 
 _CALIBRATION_POSES = 3
@@ -110,6 +111,7 @@ def create_app(
             tasks = [
                 asyncio.create_task(_become_ready(host, compiling)),
                 asyncio.create_task(host.readiness.watch.run()),
+                asyncio.create_task(host.admission.run()),
             ]
             try:
                 yield {"host": host}
@@ -216,9 +218,12 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
         )
         if levels.knows_directions:
             host.measure_ambisonics(scene, levels.with_directions(), _PAGE_ORDER)
+        host.render_costs[scene] = measure_rendering(levels, filters)
         clips = clips_of[scene]
         hello = Hello(protocol=PROTOCOL, scene=scene)
-        (best, *_) = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        best, *_, cheapest = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        if (kind := host.kind_of(hello, levels)) is not None:
+            host.admission.offer(kind, cheapest)
         session = Session(hello, levels, filters, host.clips[scene].load, quality=best, window=100)
         start = levels.bundle.manifest.start
         clip = clips[0].name if clips else None

@@ -44,6 +44,7 @@ from server.rendering.renderer import render_all
 from server.runtime.priority import become_real_time
 from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
+from server.streaming.headroom import LIMITS, saving
 from server.streaming.load_policy import LoadState, Measurement, RenderAhead, ThreadState, decide, requests_at_once
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.request_queue import RequestQueue
@@ -125,6 +126,18 @@ class AudioEngine:
         return tuple(self._thread_of)
 
     @property
+    def workers(self) -> int:
+        """The number of threads that compute IRs."""
+        return self._workers.threads
+
+    def streams_by_thread(self) -> dict["AudioThread", list[Stream]]:
+        """Return the open streams of each thread."""
+        streams: dict[AudioThread, list[Stream]] = {thread: [] for thread in self.threads}
+        for stream, thread in self._thread_of.items():
+            streams.setdefault(thread, []).append(stream)
+        return streams
+
+    @property
     def steps(self) -> Counter[LevelReason]:
         """How often the quality of a stream was changed, by reason."""
         return sum((thread.steps for thread in self.threads), Counter())
@@ -133,7 +146,7 @@ class AudioEngine:
         """Start a stream now, on the least busy thread."""
         loads = dict.fromkeys(self.threads, 0.0)
         for other, thread in self._thread_of.items():
-            loads[thread] += max(self._thresholds.presumed_load, other.load)
+            loads[thread] += max(self._thresholds.presumed_load, other.load, other.expected_load)
         thread = min(self.threads, key=loads.__getitem__)
         self._thread_of[stream] = thread
         self._share_workers()
@@ -203,6 +216,10 @@ class AudioThread:
         """How often the quality of a stream was changed, by reason."""
         self._load = ThreadState()
         self._busy_s = 0.0
+        self.busy = 0.0
+        """Share of the last second or so in which it rendered. Any thread may read it."""
+        self.least_blocks = 1
+        """Least number of blocks at once, for newcomers whose work is still to come. Any thread may set it."""
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """The streams, each with its place: its phase, and the block at which its groups of blocks begin."""
@@ -365,10 +382,16 @@ class AudioThread:
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
         """Measure the load of the thread and its streams, and carry out the decision of the load policy."""
-        busy, self._busy_s = self._busy_s / (now_s - self._looked_s), 0.0
+        period_s = now_s - self._looked_s
+        busy, self._busy_s = self._busy_s / period_s, 0.0
         self._looked_s = now_s
+        self.busy += self._thresholds.newest_weight * (busy - self.busy)
+        saved, kept = saving(LIMITS, self.blocks_at_once), math.exp(-period_s / LIMITS.memory_s)
+        for stream in self._streams:
+            stream.note_cost(period_s=period_s, saving=saved, memory=kept)
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
-        measurement = Measurement(now_s, busy, {stream: stream.sample_load(now_s) for stream in self._streams})
+        samples = {stream: stream.sample_load(now_s) for stream in self._streams}
+        measurement = Measurement(now_s, busy, samples, self.least_blocks)
         state, decision = decide(self._thresholds, state, measurement)
         self._load = state.thread
         for stream, ladder in state.ladders.items():
@@ -391,6 +414,7 @@ class AudioThread:
             if is_opening:
                 if not self._streams:
                     self._load = replace(self._load, ahead=RenderAhead())
+                    self.busy = 0.0
                 place = self._freest_place(stream.block_s)
                 stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
                 self._streams[stream] = place
