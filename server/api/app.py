@@ -11,7 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
+from starlette.types import Scope
 
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.connection import StreamHost
@@ -136,10 +137,15 @@ def create_app(
     app.include_router(documents)
     app.include_router(api)
     install_openapi(app)
-    app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
     app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
+
+
+def _turn_away(scope: Scope) -> Response | None:
+    host: StreamHost = scope["state"]["host"]
+    return host.turn_away()
 
 
 async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:

@@ -162,13 +162,7 @@ class StreamHost:
         costs = self.render_costs.get(hello.scene)
         if costs is None:
             return None
-        return kind_of(
-            hello.scene,
-            costs,
-            block_size=hello.block_size,
-            sample_rate=levels.default.sample_rate,
-            order=hello.ambisonic_order,
-        )
+        return kind_of(levels, costs, block_size=hello.block_size, order=hello.ambisonic_order)
 
     def turn_away(self) -> Response | None:
         """The answer to whoever asks for a stream while not even the cheapest has room; None if one has."""

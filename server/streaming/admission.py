@@ -31,7 +31,6 @@ from server.streaming.headroom import (
     blocks_needed,
     expected_cost,
     freest_thread,
-    granted_cost,
     headroom,
     obstacle,
     obstacle_to_change,
@@ -79,10 +78,12 @@ class Refusal:
 @dataclass(eq=False)
 class Place:
     """A stream's place on a server. `emitters` have been asked for, and room is kept for `reserved` until `until_s`;
-    until then it counts with its expected cost. `step` is the quality step on which it begins."""
+    until then it counts with its expected cost. `step` is the quality step on which it begins, on top of its ladder or
+    not."""
 
     kind: StreamKind | None
     step: QualityStep
+    is_top: bool
     thread: int
     emitters: int
     reserved: int
@@ -95,6 +96,10 @@ class Place:
     @property
     def now_on(self) -> QualityStep:
         return self.step if self.stream is None or self.is_asked else self.stream.ladder.step
+
+    @property
+    def is_on_top(self) -> bool:
+        return self.is_top if self.stream is None or self.is_asked else not self.stream.ladder.is_eased
 
 
 class Admission:
@@ -131,7 +136,8 @@ class Admission:
         self._time_s, self._loop_cpu_s, self._luck = time_s, loop_cpu_s, luck
         self._places: dict[Place, None] = {}
         self._by_stream: dict[Stream, Place] = {}
-        self._corrections: dict[tuple[str, int, int | None], Correction] = {}
+        self._corrections: dict[tuple[str, int, int | None, str], Correction] = {}
+        """By kind and quality level."""
         self._cheapest: dict[tuple[str, int, int | None], tuple[StreamKind, QualityStep]] = {}
         self._endings_s: deque[float] = deque(maxlen=limits.endings)
         self._refused_until_s: deque[float] = deque(maxlen=4 * most_streams)
@@ -208,7 +214,7 @@ class Admission:
         thread = freest_thread(self._limits, load)
         found: Scarce | None = None
         for kind, step in self._cheapest.values():
-            found = self._obstacle(load, thread, self._granted(load, thread, kind, step, 1))
+            found = self._obstacle(load, thread, self._cost_on(kind, step, 1, is_top=False))
             if found is None or found == "opening":
                 return None
         return None if found is None else self._refuse("upgrade", found)
@@ -229,19 +235,18 @@ class Admission:
         thread = freest_thread(self._limits, load)
         reserved = max(1, self._usual_emitters if emitters is None else emitters)
         if kind is None or not self._is_on:
-            return self._take(kind, steps[0], thread, reserved)
+            return self._take(kind, steps[0], thread, reserved, is_top=True)
         found: Scarce | None = None
-        for step in steps:
-            found = self._obstacle(load, thread, self._granted(load, thread, kind, step, reserved))
+        for number, step in enumerate(steps):
+            cost = self._cost_on(kind, step, reserved, is_top=not number)
+            found = self._obstacle(load, thread, cost)
             if found is None:
-                return self._take(kind, step, thread, reserved)
-        if not load.streams:
-            return self._take(kind, steps[-1], thread, reserved)
+                return self._take(kind, step, thread, reserved, is_top=not number)
         assert found is not None
         fitting = (
             step.level
             for step in others
-            if self._obstacle(load, thread, self._granted(load, thread, kind, step, reserved)) is None
+            if self._obstacle(load, thread, self._cost_on(kind, step, reserved, is_top=False)) is None
         )
         return self._refuse("hello", found, level=next(fitting, None))
 
@@ -283,7 +288,7 @@ class Admission:
         self._count_emitters(place)
         found: Scarce | None = None
         for number, step in enumerate(steps):
-            found = self._found(place, replace(place, step=step, is_asked=True))
+            found = self._found(place, replace(place, step=step, is_top=not number, is_asked=True))
             if found is None:
                 self._keep(place, self._time_s())
                 return number
@@ -314,8 +319,6 @@ class Admission:
         thread = self._thread_of(stream)
         present = self._cost_of(stream, self._time_s())
         old, new = (self._expected(each, max(1, each.emitters)) for each in (before, after))
-        if after.now_on.ir_rate_hz is not None:
-            new = granted_cost(self._limits, self._thresholds, load, thread, new)
         base = StreamCost(0.0) if is_whole else present
         less = StreamCost(0.0) if is_whole else old
         added = max(0, after.emitters - before.emitters)
@@ -326,6 +329,7 @@ class Admission:
             rate_hz=new.rate_hz,
             patience_s=new.patience_s,
             opening_s=new.request_s * added / max(1, after.emitters),
+            is_top=after.is_on_top,
             is_live=present.is_live or after.is_live,
         )
         return obstacle_to_change(self._limits, self._thresholds, load, thread, present, cost)
@@ -340,9 +344,9 @@ class Admission:
         if place.stream is not None and place.kind is not None:
             place.stream.expected_load = self._expected(place, max(place.emitters, place.reserved)).rendering
 
-    def _take(self, kind: StreamKind | None, step: QualityStep, thread: int, reserved: int) -> Place:
+    def _take(self, kind: StreamKind | None, step: QualityStep, thread: int, reserved: int, *, is_top: bool) -> Place:
         # Until its stream begins, a place is kept without end.
-        place = Place(kind, step, thread, emitters=0, reserved=reserved, until_s=math.inf)
+        place = Place(kind, step, is_top, thread, emitters=0, reserved=reserved, until_s=math.inf)
         self._places[place] = None
         if kind is not None:
             self._opening_s += self._expected(place, reserved).opening_s
@@ -366,10 +370,9 @@ class Admission:
     def _obstacle(self, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
         return obstacle(self._limits, self._thresholds, load, thread, cost)
 
-    def _granted(self, load: ServerLoad, thread: int, kind: StreamKind, step: QualityStep, emitters: int) -> StreamCost:
-        place = Place(kind, step, thread, emitters=emitters, reserved=emitters, until_s=0.0)
-        cost = self._expected(place, emitters)
-        return cost if step.ir_rate_hz is None else granted_cost(self._limits, self._thresholds, load, thread, cost)
+    def _cost_on(self, kind: StreamKind, step: QualityStep, emitters: int, *, is_top: bool) -> StreamCost:
+        place = Place(kind, step, is_top, 0, emitters=emitters, reserved=emitters, until_s=0.0)
+        return self._expected(place, emitters)
 
     def _expected(self, place: Place, emitters: int) -> StreamCost:
         if place.kind is None:
@@ -380,8 +383,9 @@ class Admission:
             place.kind,
             place.now_on,
             emitters=emitters,
-            correction=self._corrections.get(place.kind.key, Correction()),
+            correction=self._corrections.get((*place.kind.key, place.now_on.level), Correction()),
             block_sent_s=self._block_sent_s,
+            is_top=place.is_on_top,
             is_live=place.is_live,
         )
 
@@ -394,6 +398,7 @@ class Admission:
             request_s=stream.request_s if shown.responses > 0 else 0.0,
             rate_hz=shown.responses / stream.request_s if stream.request_s else 0.0,
             patience_s=patience_s(self._thresholds, stream.ladder.step) if shown.responses > 0 else math.inf,
+            is_top=not stream.ladder.is_eased,
             is_live=shown.is_live,
         )
         place = self._by_stream.get(stream)
@@ -441,7 +446,8 @@ class Admission:
             if place.kind is None or now_s < place.until_s:
                 continue
             emitters = stream.session.emitter_count
-            correction = self._corrections.get(place.kind.key, Correction())
+            key = (*place.kind.key, stream.ladder.step.level)
+            correction = self._corrections.get(key, Correction())
             plain = expected_cost(
                 self._limits, self._thresholds, place.kind, stream.ladder.step, emitters=max(1, emitters)
             )
@@ -449,7 +455,7 @@ class Admission:
             requests = correction.requests
             if stream.request_s and plain.request_s:
                 requests = min(high, max(low, stream.request_s / plain.request_s))
-            self._corrections[place.kind.key] = Correction(
+            self._corrections[key] = Correction(
                 correction.rendering + weight * (rendering - correction.rendering),
                 correction.requests + weight * (requests - correction.requests),
             )

@@ -8,7 +8,8 @@ A newcomer fits if, with it,
 - its audio thread stays below the load at which streams step down, when it renders the most blocks at once;
 - the event loop keeps up;
 - audio threads, event loop and the least share for responses fit on the cores;
-- nobody waits longer for impulse responses (IRs) than the load policy allows;
+- nobody waits longer for impulse responses (IRs) than the load policy allows: those on top of their ladders, who ask
+  for IRs as often as they like, and those below, who share a part of a core;
 - the first IRs of all newcomers delay those of the others by less than that.
 
 Shares are shares of one core. What audio threads take is stated *at one block at once*: `busy` converts it.
@@ -16,7 +17,7 @@ Shares are shares of one core. What audio threads take is stated *at one block a
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from server.streaming.load_policy import ir_share, patience_s
@@ -42,12 +43,12 @@ class Limits:
     saved_by_doubling: float = 0.1
     """Share of a thread's time that doubling the blocks at once saves at least. The load policy's number is the largest
     share; here too much trust would let too many in."""
-    full_patience: float = 0.6
+    full_patience: float = 0.5
     """Share of the patience of the load policy that a wait for IRs may take: single waits are longer than the mean."""
-    full_workers: float = 0.7
-    """Share of the time left for IRs that all requests may need together for waits to be short. Beyond it, streams wait
-    for each other's requests in turn."""
-    most_opening_s: float = 0.3
+    full_workers: float = 0.5
+    """Share of the time left for IRs that streams on top of their ladders may ask for together for waits to be short.
+    Beyond it, each waits for one request of all others in turn."""
+    most_opening_s: float = 0.1
     """Seconds for which the first IRs of newcomers may keep the workers. They go before all others, and two periods of
     the load policy with long waits are one too many."""
 
@@ -102,11 +103,13 @@ class RenderCost:
 @dataclass(frozen=True)
 class StreamKind:
     """What streams of one scene, block length and output cost on this host. `render` has the costs of each quality
-    level; `key` identifies the kind."""
+    level, and `walk` the mean cost of an IR on a walk as a share of that of one for which no other can be reused; `key`
+    identifies the kind."""
 
     key: tuple[str, int, int | None]
     block_s: float
     render: Mapping[str, RenderCost]
+    walk: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ class Correction:
 class StreamCost:
     """What a stream takes: `rendering` as a share of a core at one block at once, `loop` as a share of the event loop,
     and `rate_hz` requests for IRs per second of `request_s` CPU seconds each, for which it waits `patience_s`.
-    `opening_s` is the CPU time of its first IRs. A stream that `is_live` gets one block at a time."""
+    `opening_s` is the CPU time of its first IRs. A stream that `is_top` is on top of its ladder; one that `is_live`
+    gets one block at a time."""
 
     rendering: float
     loop: float = 0.0
@@ -129,6 +133,7 @@ class StreamCost:
     rate_hz: float = 0.0
     patience_s: float = math.inf
     opening_s: float = 0.0
+    is_top: bool = False
     is_live: bool = False
 
     @property
@@ -146,47 +151,50 @@ def expected_cost(
     emitters: int,
     correction: Correction = Correction(),
     block_sent_s: float | None = None,
+    is_top: bool = False,
     is_live: bool = False,
 ) -> StreamCost:
     """Return what a stream of a kind is expected to take on a quality step, while its listener walks."""
     rate_hz = limits.poses_hz if step.ir_rate_hz is None else min(limits.poses_hz, step.ir_rate_hz)
     share = kind.render[step.level].share(emitters=emitters, rate_hz=rate_hz, block_s=kind.block_s)
-    request_s = emitters * step.cost_ms / 1000 * correction.requests
+    new_s = emitters * step.cost_ms / 1000
+    request_s = new_s * kind.walk.get(step.level, 1.0) * correction.requests
     return StreamCost(
         rendering=share * correction.rendering,
         loop=(limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
         request_s=request_s,
         rate_hz=rate_hz,
         patience_s=patience_s(thresholds, step),
-        opening_s=request_s + limits.plan_s,
+        opening_s=new_s + limits.plan_s,
+        is_top=is_top,
         is_live=is_live,
     )
 
 
 @dataclass(frozen=True)
 class ThreadLoad:
-    """What the streams of an audio thread take at one block at once: those that can be rendered `ahead`, and those that
-    play live samples."""
+    """What the `streams` of an audio thread take at one block at once: those that can be rendered `ahead`, and those
+    that play live samples."""
 
     ahead: float = 0.0
     live: float = 0.0
+    streams: int = 0
 
     def plus(self, cost: StreamCost) -> "ThreadLoad":
-        if cost.is_live:
-            return replace(self, live=self.live + cost.rendering)
-        return replace(self, ahead=self.ahead + cost.rendering)
+        live = cost.rendering if cost.is_live else 0.0
+        return ThreadLoad(self.ahead + cost.rendering - live, self.live + live, self.streams + 1)
 
     def minus(self, cost: StreamCost) -> "ThreadLoad":
-        if cost.is_live:
-            return replace(self, live=max(0.0, self.live - cost.rendering))
-        return replace(self, ahead=max(0.0, self.ahead - cost.rendering))
+        live = cost.rendering if cost.is_live else 0.0
+        return ThreadLoad(max(0.0, self.ahead - cost.rendering + live), max(0.0, self.live - live), self.streams - 1)
 
 
 @dataclass(frozen=True)
 class ServerLoad:
-    """What all streams take. `demand` is the share of a core for all requests for IRs, `round_s` the CPU time of one
-    request of each stream, `patience_s` the least of all patiences, and `opening_s` the CPU time of first IRs that are
-    still to be computed."""
+    """What all streams take. Of those on top of their ladders, `demand` is the share of a core for all their requests
+    for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
+    below, `eased_demand` is the share of a core. `opening_s` is the CPU time of first IRs that are still to be
+    computed."""
 
     threads: tuple[ThreadLoad, ...]
     cores: int
@@ -195,34 +203,35 @@ class ServerLoad:
     demand: float = 0.0
     round_s: float = 0.0
     patience_s: float = math.inf
+    eased_demand: float = 0.0
     opening_s: float = 0.0
-    streams: int = 0
     most_streams: int = 1
+
+    @property
+    def streams(self) -> int:
+        return sum(thread.streams for thread in self.threads)
 
     def plus(self, thread: int, cost: StreamCost) -> "ServerLoad":
         """Return the load with one more stream on a thread."""
-        before, after = self.threads[:thread], self.threads[thread + 1 :]
         return replace(
-            self,
-            threads=(*before, self.threads[thread].plus(cost), *after),
-            loop=self.loop + cost.loop,
-            demand=self.demand + cost.demand,
-            round_s=self.round_s + cost.request_s,
-            patience_s=min(self.patience_s, cost.patience_s),
+            self._with(thread, self.threads[thread].plus(cost), cost, 1),
+            patience_s=min(self.patience_s, cost.patience_s) if cost.is_top else self.patience_s,
             opening_s=self.opening_s + cost.opening_s,
-            streams=self.streams + 1,
         )
 
     def minus(self, thread: int, cost: StreamCost) -> "ServerLoad":
         """Return the load without a stream of a thread; patience and first IRs stay as they are."""
-        before, after = self.threads[:thread], self.threads[thread + 1 :]
+        return self._with(thread, self.threads[thread].minus(cost), cost, -1)
+
+    def _with(self, number: int, thread: ThreadLoad, cost: StreamCost, sign: int) -> "ServerLoad":
+        top, eased = (cost.demand, 0.0) if cost.is_top else (0.0, cost.demand)
         return replace(
             self,
-            threads=(*before, self.threads[thread].minus(cost), *after),
-            loop=max(0.0, self.loop - cost.loop),
-            demand=max(0.0, self.demand - cost.demand),
-            round_s=max(0.0, self.round_s - cost.request_s),
-            streams=self.streams - 1,
+            threads=(*self.threads[:number], thread, *self.threads[number + 1 :]),
+            loop=max(0.0, self.loop + sign * cost.loop),
+            demand=max(0.0, self.demand + sign * top),
+            round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
+            eased_demand=max(0.0, self.eased_demand + sign * eased),
         )
 
 
@@ -246,9 +255,9 @@ def blocks_needed(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) ->
 
 
 def spare_cores(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
-    """Return the cores that audio threads and the event loop leave to everything else."""
-    threads = sum(busy(limits, thread, blocks_needed(limits, thresholds, thread)) for thread in load.threads)
-    return max(0.0, load.cores - threads - load.loop)
+    """Return the cores that audio threads, the event loop and plans of effects leave to everything else."""
+    threads = sum(_settled(limits, thresholds, thread) for thread in load.threads)
+    return max(0.0, load.cores - threads - load.loop - _plans(thresholds, load))
 
 
 def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
@@ -285,37 +294,60 @@ def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: in
         return "cores"
     if cost.request_s == 0:
         return None
-    for_responses = min(float(load.workers), spare_cores(limits, thresholds, load))
-    if for_responses <= 0 or not _waits_are_short(limits, load, for_responses):
+    spare = min(float(load.workers), spare_cores(limits, thresholds, load))
+    if not _waits_are_short(limits, thresholds, load, spare):
         return "responses"
-    return "opening" if load.opening_s > limits.most_opening_s * for_responses else None
+    if cost.is_top:
+        # It keeps its step when the server is full.
+        is_lasting = _waits_are_short(limits, thresholds, load, min(spare, _spare_when_full(limits, thresholds, load)))
+    else:
+        share = ir_share(thresholds, busy=_settled(limits, thresholds, load.threads[thread]))
+        interval_s = cost.request_s * load.threads[thread].streams / share
+        is_lasting = interval_s <= 1 / thresholds.least_ir_rate_hz
+    if not is_lasting:
+        return "responses"
+    return "opening" if load.opening_s > limits.most_opening_s * spare else None
 
 
-def _waits_are_short(limits: Limits, load: ServerLoad, for_responses: float) -> bool:
-    """Return whether nobody waits too long for IRs. If the workers have time for all requests, a stream waits for
-    little more than its own; if not, for one of each stream in turn."""
-    round_s = load.round_s / for_responses
-    if round_s <= limits.full_patience * load.patience_s:
+def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> float:
+    """Return the busy share of a thread at the blocks at once that it comes to."""
+    return busy(limits, thread, blocks_needed(limits, thresholds, thread))
+
+
+def _spare_when_full(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that are left when the audio threads render as much as they may."""
+    rendering = min(limits.full_rendering * len(load.threads), limits.full_cores * load.cores - load.loop)
+    return max(0.0, load.cores - rendering - load.loop - _plans(thresholds, load))
+
+
+def _plans(thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that plans of effects take at most."""
+    return thresholds.plan_share * sum(thread.streams > 0 for thread in load.threads)
+
+
+def _waits_are_short(limits: Limits, thresholds: Thresholds, load: ServerLoad, spare: float) -> bool:
+    """Return whether streams on top of their ladders get their IRs in time from so many `spare` cores, of which those
+    below have their share. If there is time for all requests, a stream waits for little more than its own; if not, for
+    one of each stream in turn."""
+    if not load.round_s:
         return True
-    each_s = round_s / max(1, load.streams)
-    return load.demand <= limits.full_workers * for_responses and each_s <= limits.full_patience * load.patience_s
+    shared = sum(
+        ir_share(thresholds, busy=_settled(limits, thresholds, thread)) for thread in load.threads if thread.streams
+    )
+    left = spare - min(load.eased_demand, shared)
+    if left <= 0:
+        return False
+    most_s = limits.full_patience * load.patience_s * left
+    return load.round_s <= most_s or load.demand <= limits.full_workers * left
 
 
 def _cores_needed(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
     """Return the cores that may not be missing: for blocks at the most at once, the event loop and the least share for
     IRs of each thread with streams."""
     most = thresholds.blocks_at_once[-1]
-    threads = [busy(limits, thread, most) for thread in load.threads]
-    least = thresholds.ir_share * thresholds.least_ir_share * sum(share > 0 for share in threads)
-    return sum(threads) + load.loop + min(least, load.demand)
-
-
-def granted_cost(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> StreamCost:
-    """Return the cost of a stream below the top of its ladder, whose IRs get no more than its part of the share of a
-    core that the load policy leaves them."""
-    share = ir_share(thresholds, busy=busy(limits, load.threads[thread], thresholds.blocks_at_once[-1]))
-    most_hz = share / max(1, load.streams + 1) / cost.request_s if cost.request_s else math.inf
-    return replace(cost, rate_hz=min(cost.rate_hz, most_hz))
+    least = thresholds.ir_share * thresholds.least_ir_share * sum(thread.streams > 0 for thread in load.threads)
+    threads = sum(busy(limits, thread, most) for thread in load.threads)
+    return threads + load.loop + min(least, load.demand + load.eased_demand)
 
 
 def freest_thread(limits: Limits, load: ServerLoad) -> int:

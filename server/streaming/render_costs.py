@@ -15,6 +15,7 @@ from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, Listene
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.responses.ir_request import IrResponse, compute_irs
+from server.scene.manifest import QualityLevel
 from server.streaming.headroom import RenderCost, StreamKind
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
@@ -45,7 +46,7 @@ def measure_rendering(
 
 
 def kind_of(
-    scene: str, costs: Mapping[str, RenderCost], *, block_size: int, sample_rate: int, order: int | None = None
+    levels: FieldsByLevel, costs: Mapping[str, RenderCost], *, block_size: int, order: int | None = None
 ) -> StreamKind:
     """Return the kind of a scene's streams in blocks of another length, or of ambisonic channels: an emitter's cost is
     taken to grow with its samples, and with its channels. What such streams really cost corrects it."""
@@ -55,7 +56,15 @@ def kind_of(
         name: RenderCost(cost.block_s, cost.emitter_s * samples * channels, cost.exchange_s * channels)
         for name, cost in costs.items()
     }
-    return StreamKind((scene, block_size, order), block_size / sample_rate, scaled)
+    walk = {name: _walk_share(field.level) for name, field in levels.items()}
+    return StreamKind((levels.bundle.id, block_size, order), block_size / levels.default.sample_rate, scaled, walk)
+
+
+def _walk_share(level: QualityLevel) -> float:
+    """Return the mean cost of an IR on a walk as a share of that of one that cannot be reused, where it is known."""
+    if level.cost is None or not level.cost.ms_miss:
+        return 1.0
+    return min(1.0, level.cost.ms_mean / level.cost.ms_miss)
 
 
 def _time_blocks(
