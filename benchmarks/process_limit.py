@@ -47,7 +47,7 @@ _LIMIT_COLUMNS = (
 def _host(core: int) -> None:
     """Serve on a core, and report the processor time of compiled calls too."""
     os.sched_setaffinity(0, {core})
-    from server.bench import gauge, host  # which start threads and count cores
+    from server.bench import gauge, host, scene  # which start threads and count cores
     from server.rendering import output
 
     spent = {"compiled_s": 0.0}
@@ -75,7 +75,7 @@ def _host(core: int) -> None:
         patch.object(gauge.Gauge, "_begin", begin_anew),
         patch.object(gauge.Gauge, "_report", with_compiled),
     ):
-        host.serve()
+        host.serve(scene.SCENE, is_metered=False)
 
 
 @contextlib.contextmanager
@@ -109,9 +109,10 @@ def _wait_until_settled(port: int) -> None:
 async def _measure(port: int, emitters: int, streams: int) -> list[Cell]:
     """Return a row of the table."""
     from server.bench.crowd import Crowd
-    from server.bench.scene import SAMPLE_RATE
+    from server.bench.places import Places
+    from server.bench.scene import SAMPLE_RATE, SCENE, bundle_of
 
-    crowd = Crowd(port, emitters=emitters, poses_per_s=30.0)
+    crowd = Crowd(port, Places.of(bundle_of(SCENE)), emitters=emitters, poses_per_s=30.0)
     try:
         await crowd.resize(streams)
         await asyncio.sleep(_SETTLE_S)

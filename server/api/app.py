@@ -11,7 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
+from starlette.types import Scope
 
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.connection import StreamHost
@@ -46,6 +47,7 @@ from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
 from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import Offer
+from server.streaming.render_costs import measure_rendering
 from server.streaming.session import Session
 
 _CALIBRATION_POSES = 3
@@ -114,6 +116,7 @@ def create_app(
             tasks = [
                 asyncio.create_task(_become_ready(host, compiling)),
                 asyncio.create_task(host.readiness.watch.run()),
+                asyncio.create_task(host.admission.run()),
             ]
             try:
                 yield {"host": host}
@@ -138,10 +141,15 @@ def create_app(
     app.include_router(documents)
     app.include_router(api)
     install_openapi(app)
-    app.add_middleware(StrictRequests, routes=app.router.routes)
+    app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
     app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
+
+
+def _turn_away(scope: Scope) -> Response | None:
+    host: StreamHost = scope["state"]["host"]
+    return host.turn_away()
 
 
 async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
@@ -220,9 +228,12 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
         )
         if levels.knows_directions:
             host.measure_ambisonics(scene, levels.with_directions(), _PAGE_ORDER)
+        host.render_costs[scene] = measure_rendering(levels, filters)
         clips = clips_of[scene]
         hello = Hello(protocol=PROTOCOL, scene=scene)
-        (best, *_) = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        best, *_, cheapest = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
+        if (kind := host.kind_of(hello, levels)) is not None:
+            host.admission.offer(kind, cheapest)
         session = Session(hello, levels, filters, host.clips[scene].load, quality=best, window=100)
         start = levels.bundle.manifest.start
         clip = clips[0].name if clips else None

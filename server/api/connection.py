@@ -23,13 +23,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
+from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
+from server.api.problems import problem
 from server.api.process_peers import ProcessPeers
 from server.api.response_cache import ResponseCache
-from server.api.settings import Settings
+from server.api.settings import Settings, usable_cores
 from server.api.stream_counts import StreamLedger
 from server.api.turn_taking import OneAtATime
 from server.api.web_socket import FastPath
@@ -40,17 +42,32 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
 from server.planning.scene_acoustics import SceneAcoustics
-from server.protocol.client_messages import AddEmitter, ClientMessage, Hello, Ping, parse_client_message
+from server.protocol.client_messages import (
+    AUTO,
+    AddEmitter,
+    ClientMessage,
+    Hello,
+    Ping,
+    RemoveEmitter,
+    SetEffects,
+    SetLevel,
+    parse_client_message,
+)
 from server.protocol.codecs.registry import Encoding
 from server.protocol.codes import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
 from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
+from server.streaming.admission import Admission, Place, Refusal
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
+from server.streaming.headroom import RenderCost, StreamKind
+from server.streaming.inbox import ChosenSteps
 from server.streaming.load_policy import Ladder
+from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import Offer, QualityStep
+from server.streaming.render_costs import kind_of
 from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
@@ -85,12 +102,15 @@ class Goodbye:
 
 _TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
 _DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
-_BUSY: Final = Goodbye(TRY_AGAIN_LATER, Error(code="server_busy", message="the server has no free stream"))
 _FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
 
 
 def _refused(refusal: RequestError) -> Goodbye:
     return Goodbye(POLICY_VIOLATION, Error.from_refusal(refusal))
+
+
+def _busy(refusal: Refusal) -> Goodbye:
+    return Goodbye(TRY_AGAIN_LATER, Error.from_refusal(refusal.error))
 
 
 @dataclass
@@ -115,17 +135,47 @@ class StreamHost:
     """Acoustics of each scene, for the planner of effects."""
     effect_costs: dict[str, Mapping[int | None, Costs]] = dataclasses.field(default_factory=dict)
     """Costs of effects by scene, once they are measured, for each order of its levels' buses and without one (None)."""
+    render_costs: dict[str, Mapping[str, RenderCost]] = dataclasses.field(default_factory=dict)
+    """Costs of rendering by scene and quality level, once they are measured."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
-    streams: int = 0
-    """Number of streams that are open or being opened."""
+    admission: Admission = dataclasses.field(init=False)
+    """The places of all streams, open or being opened."""
     openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
     """Creates sessions one after the other, since each takes about 8 ms of CPU time."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
     """Timeouts of the connections that have not sent a hello, oldest first."""
 
-    def is_full(self) -> bool:
-        return self.streams >= self.settings.max_streams
+    def __post_init__(self) -> None:
+        self.admission = Admission(
+            self.audio,
+            most_streams=self.settings.max_streams,
+            cores=usable_cores(),
+            is_on=self.settings.admission,
+            thresholds=dataclasses.replace(THRESHOLDS, ir_share=self.settings.ir_share),
+        )
+
+    @property
+    def streams(self) -> int:
+        """Number of streams that are open or being opened."""
+        return self.admission.streams
+
+    def kind_of(self, hello: Hello, levels: FieldsByLevel) -> StreamKind | None:
+        """The kind of stream that a hello asks for; None until it is measured what rendering costs."""
+        costs = self.render_costs.get(hello.scene)
+        if costs is None:
+            return None
+        return kind_of(levels, costs, block_size=hello.block_size, order=hello.ambisonic_order)
+
+    def turn_away(self) -> Response | None:
+        """The answer to whoever asks for a stream while not even the cheapest has room; None if one has."""
+        if self.readiness.obstacle is not None:
+            return None  # which a client is told in the stream
+        refusal = self.admission.turn_away()
+        if refusal is None:
+            return None
+        error = refusal.error
+        return problem(503, error.code, str(error), retry_after_s=error.retry_after_s)
 
     def measure_ambisonics(self, scene: str, levels: FieldsByLevel, order: int) -> Offer:
         """Measure what ambisonic responses of a scene's levels cost on this host, and keep the result: work for another
@@ -168,11 +218,15 @@ class Connection:
         self._capacity = MAX_WAITING_ANSWERS
         self._is_overfull = asyncio.Event()
         self._stream: Stream | None = None
+        self._place: Place | None = None
         self._encoding: Encoding = "f32"
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
         with contextlib.suppress(WebSocketDisconnect), self._host.readiness.drain.in_flight():
+            if (refusal := self._host.turn_away()) is not None:
+                await self._websocket.send_denial_response(refusal)
+                return
             await self._websocket.accept()
             goodbye = await self._serve_until_drained()
             if goodbye is not None:
@@ -198,19 +252,27 @@ class Connection:
         host = self._host
         if (obstacle := host.readiness.obstacle) is not None:
             return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
-        if host.is_full():
-            return _BUSY
         hello = await self._receive_hello()
         if isinstance(hello, Goodbye):
             return hello
-        if host.is_full():  # by now
-            return _BUSY
-        host.streams += 1
         try:
-            stream = await self._open(hello)
-            return stream if stream is None or isinstance(stream, Goodbye) else await self._pump(stream, hello)
+            levels, offer = await self._require_offer(hello)
+            if offer is None:
+                return None
+            steps, others = self._steps(hello, levels, offer)
+        except RequestError as refusal:
+            return _refused(refusal)
+        place = host.admission.admit(host.kind_of(hello, levels), steps, hello.emitters, others=others)
+        if isinstance(place, Refusal):
+            return _busy(place)
+        try:
+            stream = await self._open(hello, levels, offer, Ladder(steps, steps.index(place.step)))
+            if stream is None or isinstance(stream, Goodbye):
+                return stream
+            host.admission.open(place, stream)
+            return await self._pump(stream, hello, place)
         finally:
-            host.streams -= 1
+            host.admission.leave(place)
 
     async def _receive_hello(self) -> Hello | Goodbye:
         host = self._host
@@ -233,24 +295,32 @@ class Connection:
             return Goodbye(POLICY_VIOLATION, error)
         return message
 
-    async def _open(self, hello: Hello) -> Stream | Goodbye | None:
+    async def _require_offer(self, hello: Hello) -> tuple[FieldsByLevel, Offer | None]:
+        """The levels that a hello may have, and their costs; None for these if the client has gone meanwhile. Raises
+        RequestError for a scene or an output that there is not."""
+        levels = self._host.scenes.get(hello.scene)
+        if levels is None:
+            raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+        if hello.ambisonic_order is not None:
+            levels = levels.with_directions(hello.level)
+        return levels, await self._offer(hello, levels)
+
+    def _steps(
+        self, hello: Hello, levels: FieldsByLevel, offer: Offer
+    ) -> tuple[tuple[QualityStep, ...], tuple[QualityStep, ...]]:
+        """The steps of the level that a hello asks for, and for another level than auto those of auto."""
+        block_s = hello.block_size / levels.default.sample_rate
+        steps = offer.steps(hello.level, block_s=block_s)
+        return steps, () if hello.level == AUTO else offer.steps(AUTO, block_s=block_s)
+
+    async def _open(self, hello: Hello, levels: FieldsByLevel, offer: Offer, ladder: Ladder) -> Stream | Goodbye | None:
         """Open a stream. Returns None if the client has gone meanwhile."""
         settings = self._host.settings
-        levels = self._host.scenes.get(hello.scene)
+        field = levels.default
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
         window = settings.window_blocks + hello.buffer_blocks
         self._capacity = window + MAX_WAITING_ANSWERS
         try:
-            if levels is None:
-                raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
-            if hello.ambisonic_order is not None:
-                levels = levels.with_directions(hello.level)
-            field = levels.default
-            block_s = hello.block_size / field.sample_rate
-            offer = await self._offer(hello, levels)
-            if offer is None:
-                return None
-            ladder = Ladder(offer.steps(hello.level, block_s=block_s))
             session = await self._host.openings.run(
                 partial(self._open_session, hello, levels, hrtf, ladder.step, window), is_wanted=self._is_there
             )
@@ -280,7 +350,7 @@ class Connection:
             levels,
             offer=offer,
             ladder=ladder,
-            block_s=block_s,
+            block_s=hello.block_size / field.sample_rate,
             lead=hello.buffer_blocks,
             deliver=self._deliver,
         )
@@ -318,9 +388,9 @@ class Connection:
             costs=lambda bus: host.effect_costs.get(hello.scene, {}).get(bus, {}),
         )
 
-    async def _pump(self, stream: Stream, hello: Hello) -> Goodbye | None:
+    async def _pump(self, stream: Stream, hello: Hello, place: Place) -> Goodbye | None:
         """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
-        self._stream, self._encoding = stream, hello.encoding
+        self._stream, self._place, self._encoding = stream, place, hello.encoding
         self._host.ledger.open(stream)
         self._host.audio.open(stream)
         tasks = [
@@ -333,7 +403,7 @@ class Connection:
         finally:
             self._host.audio.close(stream)
             self._host.ledger.close(stream)
-            self._stream = None
+            self._stream = self._place = None
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
@@ -378,11 +448,34 @@ class Connection:
             self._enqueue([Error.from_refusal(refusal)])
 
     def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
-        """Answer a ping, or put the message into the stream's inbox. Raises RequestError too_many_messages."""
+        """Answer a ping, or put the message into the stream's inbox. Raises RequestError too_many_messages, or
+        server_busy for what has no room."""
         if isinstance(message, Ping):
             self._enqueue([Pong(id=message.id)])
-        elif not stream.offer(message):
+        elif not stream.offer(self._admitted(message, stream)):
             raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
+
+    def _admitted(self, message: ClientMessage, stream: Stream) -> ClientMessage | ChosenSteps:
+        """The message, or what to do in its place, if there is room for what it asks for. Raises RequestError
+        server_busy if there is not, and unknown_level."""
+        place, admission = self._place, self._host.admission
+        assert place is not None
+        refusal: Refusal | int | None = None
+        match message:
+            case AddEmitter():
+                refusal = admission.add_emitter(place, is_live=message.live)
+            case RemoveEmitter():
+                admission.remove_emitter(place)
+            case SetEffects() if any(message.effects.values()) or message.output not in {None, "mono"}:
+                refusal = admission.add_effects(place)
+            case SetLevel():
+                steps = stream.steps(message.level)
+                refusal = admission.choose(place, steps)
+                if isinstance(refusal, int):
+                    return ChosenSteps(steps, refusal)
+        if isinstance(refusal, Refusal):
+            raise refusal.error
+        return message
 
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()

@@ -31,7 +31,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "preflight_refused": "400: pages of this site may not send such a request; the detail says what they may",
     "request_line_too_long": "414: the URL is longer than the server takes",
     "request_timeout": "408: the request did not arrive whole in time",
-    "server_busy": "503: too many computations wait; ask again after `Retry-After`",
+    "server_busy": "503: too many computations wait, or no stream has room; ask again after `Retry-After`",
     "server_draining": "503: the server is shutting down; ask again there or elsewhere",
     "test_full": "503: a listening test takes no more listeners",
     "too_many_connections": "503: every connection is in use",

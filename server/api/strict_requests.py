@@ -7,7 +7,7 @@ ignored.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, get_args, get_origin
@@ -48,11 +48,18 @@ def _is_list(annotation: Any) -> bool:
 
 
 class StrictRequests:
-    """ASGI middleware over the application with these `routes`. Routes may be added until the first request."""
+    """ASGI middleware over the application with these `routes`. Routes may be added until the first request.
 
-    def __init__(self, app: ASGIApp, *, routes: Sequence[BaseRoute]) -> None:
+    A plain GET of a WebSocket's address gets the answer of `closed`, if there is one: browsers do not tell a page why a
+    WebSocket was refused, so it asks again in this way.
+    """
+
+    def __init__(
+        self, app: ASGIApp, *, routes: Sequence[BaseRoute], closed: Callable[[Scope], Response | None] = lambda _: None
+    ) -> None:
         self._app = app
         self._routes = routes
+        self._closed = closed
 
     @cached_property
     def _declared(self) -> tuple[DeclaredRoute, ...]:
@@ -67,7 +74,7 @@ class StrictRequests:
         if not found:
             await self._app(scope, receive, send)
             return
-        refusal = _refusal(scope, found)
+        refusal = _refusal(scope, found, self._closed)
         if refusal is not None:
             await refusal(scope, receive, send)
         elif scope["method"] == "HEAD":
@@ -76,10 +83,14 @@ class StrictRequests:
             await self._app(scope, receive, send)
 
 
-def _refusal(scope: Scope, found: Sequence[DeclaredRoute]) -> Response | None:
+def _refusal(
+    scope: Scope, found: Sequence[DeclaredRoute], closed: Callable[[Scope], Response | None]
+) -> Response | None:
     """The answer in place of the route's; None if the request is allowed."""
     methods = set().union(*(route.methods for route in found))
     if not methods:
+        if (answer := closed(scope)) is not None:
+            return answer
         refused = problem(426, "upgrade_required", "this is a WebSocket: connect with ws:// or wss://")
         refused.headers["Upgrade"] = "websocket"
         return refused

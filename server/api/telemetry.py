@@ -20,6 +20,7 @@ from server.assets.clips import ClipLibrary
 from server.core.durations import DurationHistogram
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
+from server.streaming.admission import Admission
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.plan_audit import RegretRecord
 from server.streaming.quality_steps import Offer
@@ -46,6 +47,9 @@ class Host(Protocol):
 
     @property
     def readiness(self) -> Readiness: ...
+
+    @property
+    def admission(self) -> Admission: ...
 
 
 class ServerCollector(Collector):
@@ -87,6 +91,7 @@ class ServerCollector(Collector):
         )
         yield from self._audio_threads()
         yield self._level_costs()
+        yield from _admission(self._host.admission)
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
 
@@ -196,6 +201,22 @@ def _threads(watch: ThreadWatch) -> Iterator[Metric]:
         restarts.add_metric([name], watch.restarts[name])
     yield healthy
     yield restarts
+
+
+def _admission(admission: Admission) -> Iterator[Metric]:
+    yield GaugeMetricFamily(
+        "nafir_headroom",
+        "Share of the server that is free for more streams, from 0 to 1, of what is scarcest.",
+        value=admission.headroom,
+    )
+    refusals = CounterMetricFamily(
+        "nafir_refusals",
+        "What was refused because it would have broken somebody's sound, and what there was too little of.",
+        labels=["asked", "reason"],
+    )
+    for (asked, scarce), count in admission.refusals.items():
+        refusals.add_metric([asked, scarce], count)
+    yield refusals
 
 
 def _regrets(record: RegretRecord) -> Iterator[Metric]:

@@ -28,6 +28,7 @@ from server.core.durations import DurationHistogram
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
 from server.protocol.server_messages import Durations
+from server.rendering.convolver import Sharing
 from server.streaming.quality_steps import QualityStep
 from server.streaming.stream import Stream
 
@@ -274,7 +275,8 @@ class Gauge:
 def _describe(quality: QualityStep) -> str:
     """A quality step in words, such as "standard, 5 responses a second"."""
     rate = "" if quality.ir_rate_hz is None else f", {quality.ir_rate_hz:g} responses a second"
-    return f"{quality.level}{rate}{', shared tail' if quality.shared_tail else ''}"
+    shared = {Sharing.NOTHING: "", Sharing.TAIL: ", shared tail", Sharing.REVERBERATION: ", shared reverberation"}
+    return f"{quality.level}{rate}{shared[quality.sharing]}"
 
 
 def _thread_cpu_s(thread: threading.Thread) -> float:

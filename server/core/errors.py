@@ -21,7 +21,8 @@ class RequestError(NafirError):
     """A request cannot be answered.
 
     `code` is stable and machine-readable, `field` names the input at fault if there is one, and `status` is the HTTP
-    status (a WebSocket client gets the code instead). `retry_after_s` says after how long a retry is worthwhile.
+    status (a WebSocket client gets the code instead). `retry_after_s` says after how long a retry is worthwhile, and
+    `level` at which quality level the request could be met now.
     """
 
     def __init__(
@@ -32,12 +33,14 @@ class RequestError(NafirError):
         field: str | None = None,
         status: int = 422,
         retry_after_s: int | None = None,
+        level: str | None = None,
     ) -> None:
         super().__init__(message)
         self.code = code
         self.field = field
         self.status = status
         self.retry_after_s = retry_after_s
+        self.level = level
 
 
 class FieldError(RequestError):

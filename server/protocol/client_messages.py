@@ -97,7 +97,9 @@ class Hello(Message):
     one under load. `output` says what plays the sound: for a mono loudspeaker, blocks have one channel. With
     `ambisonics` blocks have the channels of `order` 1 (the default), 2 or 3 in the axes of the scene: ACN order, SN3D
     norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn then changes nothing in
-    the blocks. `effects` switches effects on or off, whatever the plan would decide."""
+    the blocks. `effects` switches effects on or off, whatever the plan would decide. `emitters` is how many emitters
+    the client is about to add: the server lets the stream in only if they fit, and keeps room for them for some
+    seconds. Without it the server expects as many as other streams have; servers up to 0.1 refuse it."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -111,6 +113,7 @@ class Hello(Message):
     output: Output = "headphones"
     order: Annotated[int, Field(ge=1, le=HIGHEST_ORDER), WHOLE] | None = None
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
+    emitters: Annotated[int, Field(ge=0, le=64), WHOLE] | None = None
     # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
 

@@ -9,7 +9,7 @@ NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 100
 ERROR_CODES: Final[Mapping[str, str]] = {
     "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",
     "server_draining": "the server is shutting down; open the stream again, there or elsewhere",
-    "server_busy": "the server has no free stream",
+    "server_busy": "the stream, emitter, level or effect would break somebody's sound, or no stream is free; ask later",
     "hello_expected": "the first message was not a hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
     "unsupported_protocol": "the server speaks another version of the protocol",
@@ -54,6 +54,6 @@ CLOSE_CODES: Final[Mapping[int, str]] = {
     POLICY_VIOLATION: "the hello was refused or did not come, or the client reads too slowly or acknowledges nothing",
     INTERNAL_ERROR: "the stream failed because of a defect of the server",
     SERVICE_RESTART: "the server is shutting down",
-    TRY_AGAIN_LATER: "the server is not ready, or has no free stream",
+    TRY_AGAIN_LATER: "the server is not ready, or has no room for the stream",
 }
 """Meanings by close code. The web server itself closes with 1002, 1007 and 1009."""

@@ -209,16 +209,28 @@ class Pong(Message):
 
 
 class Error(Message):
-    """Says what was wrong with a message. The stream goes on, unless the message was the hello."""
+    """Says what was wrong with a message. The stream goes on, unless the message was the hello.
+
+    What a server refuses because it has too much to do (`server_busy`) may be asked for again after `retry_after_s`
+    seconds. `level` is the quality level at which a stream that insists on another would fit now, if there is one.
+    """
 
     type: Literal["error"] = "error"
     code: str
     message: str
     field: str | None = None
+    retry_after_s: Annotated[int | None, Field(exclude_if=lambda seconds: seconds is None)] = None
+    level: Annotated[str | None, Field(exclude_if=lambda level: level is None)] = None
 
     @classmethod
     def from_refusal(cls, refusal: RequestError) -> Self:
-        return cls(code=refusal.code, message=str(refusal), field=refusal.field)
+        return cls(
+            code=refusal.code,
+            message=str(refusal),
+            field=refusal.field,
+            retry_after_s=refusal.retry_after_s,
+            level=refusal.level,
+        )
 
 
 ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error

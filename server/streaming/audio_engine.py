@@ -51,6 +51,7 @@ from server.runtime.priority import become_real_time
 from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
 from server.streaming.balance import BalanceState, ThreadLoad, balance
+from server.streaming.headroom import LIMITS, saving
 from server.streaming.load_policy import LoadState, Measurement, RenderAhead, ThreadState, decide, requests_at_once
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.request_queue import RequestQueue
@@ -147,6 +148,18 @@ class AudioEngine:
         return tuple(self._thread_of)
 
     @property
+    def workers(self) -> int:
+        """The number of threads that compute IRs."""
+        return self._workers.threads
+
+    def streams_by_thread(self) -> dict["AudioThread", list[Stream]]:
+        """Return the open streams of each thread."""
+        streams: dict[AudioThread, list[Stream]] = {thread: [] for thread in self.threads}
+        for stream, thread in self._thread_of.items():
+            streams.setdefault(thread, []).append(stream)
+        return streams
+
+    @property
     def steps(self) -> Counter[LevelReason]:
         """How often the quality of a stream was changed, by reason."""
         return sum((thread.steps for thread in self.threads), Counter())
@@ -199,12 +212,14 @@ class AudioEngine:
 
     def _loads(self) -> dict["AudioThread", dict[Stream, float]]:
         """Return the share of a core of each stream, by thread. A stream that has just opened has shown little of what
-        it will need, so it is taken to need as much as the others do on average."""
+        it will need, so it is taken to need what is expected of it, and no less than the others do on average."""
         heard = [stream.load for stream in self._thread_of if stream.is_measured]
         presumed = max(self._thresholds.presumed_load, sum(heard) / len(heard) if heard else 0.0)
         loads: dict[AudioThread, dict[Stream, float]] = {thread: {} for thread in self.threads}
         for stream, thread in self._thread_of.items():
-            loads[thread][stream] = stream.load if stream.is_measured else max(presumed, stream.load)
+            loads[thread][stream] = (
+                stream.load if stream.is_measured else max(presumed, stream.load, stream.expected_load)
+            )
         return loads
 
     def _balance(self) -> None:
@@ -271,6 +286,10 @@ class AudioThread:
         self._load = ThreadState()
         self._busy_s = 0.0
         self._busy = 0.0
+        self.mean_busy = 0.0
+        """Share of the last second or so in which it rendered. Any thread may read it."""
+        self.least_blocks = 1
+        """Least number of blocks at once, for newcomers whose work is still to come. Any thread may set it."""
         self._looked_s = time_s()
         self._streams: dict[Stream, int] = {}
         """The streams, each with its place: its phase, and the block at which its groups of blocks begin."""
@@ -465,11 +484,17 @@ class AudioThread:
 
     def _look(self, now_s: float, made: dict[Stream, list[Outgoing]]) -> None:
         """Measure the load of the thread and its streams, and carry out the decision of the load policy."""
-        self._busy = busy = self._busy_s / (now_s - self._looked_s)
+        period_s = now_s - self._looked_s
+        self._busy = busy = self._busy_s / period_s
         self._busy_s = 0.0
         self._looked_s = now_s
+        self.mean_busy += self._thresholds.newest_weight * (busy - self.mean_busy)
+        saved, kept = saving(LIMITS, self.blocks_at_once), math.exp(-period_s / LIMITS.memory_s)
+        for stream in self._streams:
+            stream.note_cost(period_s=period_s, saving=saved, memory=kept)
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
-        measurement = Measurement(now_s, busy, {stream: stream.sample_load(now_s) for stream in self._streams})
+        samples = {stream: stream.sample_load(now_s) for stream in self._streams}
+        measurement = Measurement(now_s, busy, samples, self.least_blocks)
         state, decision = decide(self._thresholds, state, measurement)
         self._load = state.thread
         for stream, ladder in state.ladders.items():
@@ -491,6 +516,7 @@ class AudioThread:
     def _start(self, stream: Stream, now_s: float) -> None:
         if not self._streams:
             self._load = replace(self._load, ahead=RenderAhead())
+            self.mean_busy = 0.0
         place = self._freest_place(stream.block_s)
         stream.start(self._origin_of(place % PHASES, stream.block_s, now_s))
         self._streams[stream] = place

@@ -14,9 +14,18 @@ from server.planning.plan import Plan
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose
 from server.responses.ir_request import IrRequest, IrResponse
 from server.streaming.plan_audit import Regret
+from server.streaming.quality_steps import QualityStep
 
 MAX_WAITING_MESSAGES = 256
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ChosenSteps:
+    """A client's choice of a quality level: its steps, and the number of the one to begin on."""
+
+    steps: tuple[QualityStep, ...]
+    at: int
 
 
 @dataclass(frozen=True)
@@ -37,9 +46,9 @@ class Inbox:
         self.regrets: deque[Regret | BaseException] = deque()
         self.brings_emitter = False
         """Whether a waiting message adds an emitter."""
-        self._messages: deque[tuple[float, ClientMessage]] = deque()
+        self._messages: deque[tuple[float, ClientMessage | ChosenSteps]] = deque()
 
-    def put_message(self, message: ClientMessage, now_s: float) -> bool:
+    def put_message(self, message: ClientMessage | ChosenSteps, now_s: float) -> bool:
         """Queue a message; return False, and refuse it, if too many are waiting. A listener's pose replaces an older
         one directly before it, and counts from when that one arrived: the listener has waited since then."""
         if not self._replace_pose(message):
@@ -49,7 +58,7 @@ class Inbox:
         self.brings_emitter |= isinstance(message, AddEmitter)
         return True
 
-    def _replace_pose(self, message: ClientMessage) -> bool:
+    def _replace_pose(self, message: ClientMessage | ChosenSteps) -> bool:
         if not (isinstance(message, ListenerPose) and self._messages):
             return False
         try:
@@ -71,7 +80,7 @@ class Inbox:
         """Whether a response or a plan has arrived, which is processed before the next block."""
         return bool(self.responses or self.plans)
 
-    def take_messages(self) -> Iterator[tuple[float, ClientMessage]]:
+    def take_messages(self) -> Iterator[tuple[float, ClientMessage | ChosenSteps]]:
         """Take the messages that wait now, each with its time of arrival."""
         for _ in range(len(self._messages)):
             yield self._messages.popleft()

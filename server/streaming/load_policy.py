@@ -49,11 +49,13 @@ class LoadSample:
 
 @dataclass(frozen=True)
 class Measurement(Generic[Key]):
-    """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it."""
+    """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it.
+    `least_blocks` is the least number of blocks at once, for newcomers whose work is still to come."""
 
     now_s: float
     busy: float
     streams: Mapping[Key, LoadSample]
+    least_blocks: int = 1
 
     @property
     def lateness(self) -> float:
@@ -261,9 +263,12 @@ def _judge_thread(
     busy, lateness = measurement.busy, measurement.lateness
     is_overloaded = (busy > thresholds.full_busy and not can_make_time) or lateness > thresholds.tight
     is_well = busy <= thresholds.free_busy and lateness <= thresholds.easy
+    ahead = render_ahead(thresholds, thread.ahead, busy=busy, lateness=lateness)
+    if ahead.blocks < measurement.least_blocks:
+        ahead = RenderAhead(measurement.least_blocks, caution=thread.ahead.caution)
     return replace(
         thread,
-        ahead=render_ahead(thresholds, thread.ahead, busy=busy, lateness=lateness),
+        ahead=ahead,
         overloaded_periods=thread.overloaded_periods + 1 if is_overloaded else 0,
         well_since_s=_since(thread.well_since_s, measurement.now_s, is_so=is_well),
     )

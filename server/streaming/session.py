@@ -150,6 +150,11 @@ class Session:
         return self.renderer.sample_clock
 
     @property
+    def emitter_count(self) -> int:
+        """The number of emitters. Any thread may read it."""
+        return len(self._emitters)
+
+    @property
     def quality(self) -> QualityStep:
         """The quality that is playing."""
         return self._responses.heard

@@ -23,11 +23,11 @@ from server.protocol.server_messages import Durations, Error, LevelReason, Serve
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
-from server.streaming.inbox import ComputedResponse, Inbox, PendingWork
+from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, PendingWork
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
-from server.streaming.quality_steps import Offer
+from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.request_queue import RequestQueue
 from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
@@ -71,6 +71,24 @@ class CpuCosts:
 
 
 @dataclass
+class ShownCost:
+    """What a stream has shown that it takes, as shares of a core: the highest of the last half minute or so. Readers on
+    other threads may find one value newer than another."""
+
+    rendering: float = 0.0
+    """Share of an audio thread that its blocks would take at one block at once."""
+    responses: float = 0.0
+    """Share of a core that its impulse responses take."""
+    is_live: bool = False
+    """Whether it plays live samples, so that it is rendered block by block."""
+
+    def note(self, *, rendering: float, responses: float, memory: float) -> None:
+        """Note the costs of a period, after which the share `memory` of higher ones before is left."""
+        self.rendering = max(rendering, rendering + memory * (self.rendering - rendering))
+        self.responses = max(responses, responses + memory * (self.responses - responses))
+
+
+@dataclass
 class Pause:
     """Whether a stream is paused, and since when its window has been full."""
 
@@ -103,6 +121,8 @@ class Stream:
         self.regrets = RegretRecord()
         self.load = 0.0
         """Smoothed share of a core that its blocks take."""
+        self.expected_load = 0.0
+        """Share of a core that its blocks are expected to take until they have shown what they take."""
         self.next_block = 0
         self.due_s = math.inf
         """When the next block should be rendered; infinite before the start and in a pause."""
@@ -112,6 +132,9 @@ class Stream:
         self._has_asked = False
         self._wait = ResponseWait()
         self._costs = CpuCosts()
+        self.shown = ShownCost()
+        self._request_cpu_s = 0.0
+        """CPU time of the requests that were answered in this period."""
         self._inbox = Inbox()
         self._pending = PendingWork()
         self._pause = Pause()
@@ -157,7 +180,11 @@ class Stream:
         those of its streams."""
         self._wake, self._time_s, self._turns = wake, time_s, turns
 
-    def offer(self, message: ClientMessage) -> bool:
+    def steps(self, level: str) -> tuple[QualityStep, ...]:
+        """Return the quality steps of a level, or of auto. Raises RequestError unknown_level."""
+        return self._offer.steps(level, block_s=self.block_s)
+
+    def offer(self, message: ClientMessage | ChosenSteps) -> bool:
         """Queue a message for the audio thread; return False, and refuse it, if too many are waiting.
 
         A message that calls for an impulse response, if one can be requested now, wakes the thread; all others wait for
@@ -222,7 +249,10 @@ class Stream:
         while inbox.plans:
             outgoing += self._take_plan(inbox.plans.popleft())
         for arrived_s, message in inbox.take_messages():
-            refused = self._choose(message) if isinstance(message, SetLevel) else self.session.receive(message)
+            if isinstance(message, SetLevel | ChosenSteps):
+                refused = self._choose(message)
+            else:
+                refused = self.session.receive(message)
             if isinstance(message, ListenerPose | MoveEmitter) and not refused:
                 self.times.arrive(message.pose_id, arrived_s)
             outgoing += refused
@@ -259,6 +289,19 @@ class Stream:
     def leave(self) -> None:
         """Cancel all work requested by this stream."""
         self._pending.cancel()
+
+    @property
+    def request_s(self) -> float:
+        """The smoothed CPU time of a request for impulse responses; 0 before the first answer."""
+        return self._costs.request_s
+
+    def note_cost(self, *, period_s: float, saving: float, memory: float) -> None:
+        """Note what the stream took in the last `period_s`, in which its blocks took the share `saving` of what they
+        take one at a time."""
+        self.shown.is_live = not self.session.renderer.runs_by_itself
+        rendering = self.load / (1.0 if self.shown.is_live else saving)
+        responses, self._request_cpu_s = self._request_cpu_s / period_s, 0.0
+        self.shown.note(rendering=rendering, responses=responses, memory=memory)
 
     def sample_load(self, now_s: float) -> LoadSample:
         """Return the load of this stream since the last call."""
@@ -333,11 +376,13 @@ class Stream:
             self.clock.slip(self.next_block, self._time_s())
             self.due_s = self.clock.due_s(self.next_block)
 
-    def _choose(self, message: SetLevel) -> list[ServerMessage]:
+    def _choose(self, chosen: SetLevel | ChosenSteps) -> list[ServerMessage]:
+        """Change to the first step of a level, or to the step that was chosen for it."""
         try:
-            self.ladder = Ladder(self._offer.steps(message.level, block_s=self.block_s))
+            at = chosen if isinstance(chosen, ChosenSteps) else ChosenSteps(self.steps(chosen.level), 0)
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
+        self.ladder = Ladder(at.steps, at.at)
         self._wait.restart(self._time_s())
         return self.session.set_quality(self.ladder.step, "chosen")
 
@@ -388,6 +433,7 @@ class Stream:
             return self.session.give_up(request)
         self.times.response.add(computed.duration_s)
         self._costs.request_s = _smoothed(self._costs.request_s, computed.cpu_s)
+        self._request_cpu_s += computed.cpu_s
         return self.session.accept(computed.response)
 
     def _status(self, now_s: float) -> Status:

@@ -2,12 +2,12 @@ import json
 import math
 import struct
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
 import soundfile
-from starlette.testclient import TestClient
+from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
 from server.api.app import create_app
@@ -321,14 +321,20 @@ def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client_of_
         client_of_few.websocket_connect("/v1/stream") as second,
     ):
         Ears(first), Ears(second)
-        with client_of_few.websocket_connect("/v1/stream") as third:
-            assert parse_server_message(third.receive_text()).code == "server_busy"
-            with pytest.raises(WebSocketDisconnect) as closed:
-                third.receive_text()
-            assert closed.value.code == 1013
+        with (
+            pytest.raises(WebSocketDenialResponse) as refused,
+            client_of_few.websocket_connect("/v1/stream"),
+        ):
+            pass
+        answers = refused.value, client_of_few.get("/v1/stream")
+        assert [(answer.status_code, answer.json()["code"]) for answer in answers] == [(503, "server_busy")] * 2
+        assert all(1 <= int(answer.headers["retry-after"]) <= 60 for answer in answers)
         second.close()
         for _ in range(100):
-            with client_of_few.websocket_connect("/v1/stream") as socket:
+            with (
+                suppress(WebSocketDenialResponse),
+                client_of_few.websocket_connect("/v1/stream") as socket,
+            ):
                 socket.send_text(HELLO.serialize())
                 if parse_server_message(socket.receive_text()).type == "welcome":
                     return

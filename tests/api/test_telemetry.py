@@ -12,6 +12,7 @@ from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
+from server.streaming.admission import Admission
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.load_policy import Ladder, RenderAhead, ThreadState
 from server.streaming.quality_steps import Offer
@@ -30,6 +31,7 @@ class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
         self.ledger = StreamLedger()
+        self.admission = Admission(audio, most_streams=1, cores=2)
         self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
 
 
@@ -149,3 +151,13 @@ def test_a_histogram_sums_what_it_counts():
     first.merge(second)
     assert first.total_s == pytest.approx(0.75)
     assert first.cumulative()[-1][1] == 2
+
+
+def test_headroom_and_refusals_by_reason_are_told(host, field, filters):
+    assert samples(host)["nafir_headroom",] == 1.0
+    assert samples(host)["nafir_refusals_total", ("asked", "upgrade"), ("reason", "streams")] == 0
+    open_stream(host, field, filters)
+    host.admission.turn_away()
+    host.admission.measure()
+    assert samples(host)["nafir_headroom",] == 0.0
+    assert samples(host)["nafir_refusals_total", ("asked", "upgrade"), ("reason", "streams")] == 1

@@ -22,6 +22,7 @@ from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
 from server.scene.manifest import Manifest
+from server.streaming.admission import Admission
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.load_thresholds import Thresholds
 from tests.engine_stage import Patient
@@ -129,6 +130,7 @@ class Host:
     def __init__(self) -> None:
         self.audio = AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0)
         self.ledger = StreamLedger()
+        self.admission = Admission(self.audio, most_streams=1, cores=2)
         self.readiness = Readiness(Drain(8.0), ThreadWatch((self.audio,)), warm_up="done")
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}

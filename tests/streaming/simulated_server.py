@@ -27,7 +27,9 @@ from server.protocol.client_messages import AUTO, ListenerPose
 from server.rendering.output import Rendered
 from server.scene.manifest import QualityLevel, Reuse
 from server.streaming import audio_engine
+from server.streaming.admission import Admission, Place, Refusal
 from server.streaming.audio_engine import AudioEngine
+from server.streaming.headroom import RenderCost, StreamKind
 from server.streaming.inbox import ComputedResponse
 from server.streaming.load_policy import Ladder
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
@@ -248,7 +250,8 @@ class SimulatedSession:
     runs_by_itself = True
     blocks_dropped = ir_exchanges = blocks_limited = 0
 
-    def __init__(self, quality) -> None:
+    def __init__(self, quality, emitters: int = 1) -> None:
+        self.emitter_count = emitters
         self.window = SendWindow(2**40)
         self.renderer = self
         self.quality = self.wanted = quality
@@ -352,6 +355,10 @@ class Client:
     """When its stream moved to which step; 0 is the best."""
     answers_s: list[float] = field(default_factory=list)
     """When responses came."""
+    began_at: int = 0
+    """The step on which the server let it in."""
+    refused: Refusal | None = None
+    place: Place | None = None
 
 
 @dataclass(frozen=True)
@@ -379,6 +386,7 @@ class SimulatedServer:
         levels: tuple[SimulatedLevel, ...] = LEVELS,
         poses_hz: float = 30.0,
         seed: int = 0,
+        admits: bool = False,
     ) -> None:
         self.threads = max(1, len(speeds) - 1)
         """Of workers."""
@@ -394,11 +402,27 @@ class SimulatedServer:
         self._busy_s = 0.0
         self._worst = 0.0
         self._by_session: dict[SimulatedSession, Client] = {}
-        self._offer = Offer(tuple(each.level for each in levels), {each.level.name: each.miss_ms for each in levels})
+        here_ms = {each.level.name: each.miss_ms / speeds[-1] for each in levels}
+        self._offer = Offer(tuple(each.level for each in levels), here_ms)
         self.engine = AudioEngine(self._post, self, thresholds=thresholds, time_s=self.machine)
         (self.thread,) = self.engine.threads
         self.thread._wake = _Flag(self.machine)
         self.thread._has_arrived = _Flag(self.machine, is_set=True)
+        self._loop_s = 0.0
+        """CPU time of the event loop."""
+        self.admission = Admission(
+            self.engine,
+            most_streams=1_000,
+            cores=len(speeds),
+            is_on=admits,
+            thresholds=thresholds,
+            time_s=self.machine,
+            loop_cpu_s=lambda: self._loop_s,
+            luck=lambda: float(self._rng.random()),
+        )
+        self._kind = self._measured_kind(speeds[0]) if admits else None
+        if self._kind is not None:
+            self.admission.offer(self._kind, self._offer.steps(AUTO, block_s=BLOCK_S)[-1])
         self._period = itertools.count(1)
         self._look_again()
 
@@ -414,6 +438,25 @@ class SimulatedServer:
             self.machine.at(self.began_s + client.opened_s, lambda client=client: self._open(client))
             if until_s < _NEVER:
                 self.machine.at(self.began_s + until_s, lambda client=client: self.engine.close(client.stream))
+        return come
+
+    def arrive(
+        self,
+        count: int,
+        *,
+        at_s: float = 0.0,
+        every_s: float = 0.0,
+        until_s: float = _NEVER,
+        emitters: int = 32,
+        announces: bool = True,
+    ) -> list[Client]:
+        """Have clients come and be let in or refused; some of them say how many emitters they have."""
+        come = [Client(emitters, at_s + number * every_s, closed_s=until_s) for number in range(count)]
+        for client in come:
+            self.clients.append(client)
+            self.machine.at(self.began_s + client.opened_s, lambda client=client: self._ask(client, announces))
+            if until_s < _NEVER:
+                self.machine.at(self.began_s + until_s, lambda client=client: self._leave(client))
         return come
 
     def pause(self, at_s: float, duration_s: float) -> None:
@@ -446,9 +489,36 @@ class SimulatedServer:
 
     # What the audio engine asks of what is around it.
 
+    def _measured_kind(self, speed: float) -> StreamKind:
+        """What a server measures when it starts: costs of one stream alone."""
+        each_s, exchange_s = self._costs.block_s / 16 / speed, self._costs.exchange_s / 16 / speed
+        render = {}
+        for name, level in self._levels.items():
+            share = self._costs.shared_tail if level.level.shared_tail else 1.0
+            render[name] = RenderCost(self._costs.tick_s / speed, share * each_s, exchange_s)
+        walk = {name: level.walk_ms / level.miss_ms for name, level in self._levels.items()}
+        return StreamKind(("simulated", 1_024, None), BLOCK_S, render, walk)
+
+    def _ask(self, client: Client, announces: bool) -> None:
+        steps = self._offer.steps(AUTO, block_s=BLOCK_S)
+        answer = self.admission.turn_away()
+        if answer is None:
+            answer = self.admission.admit(self._kind, steps, client.emitters if announces else None)
+        if isinstance(answer, Refusal):
+            client.refused = answer
+            return
+        client.place, client.began_at = answer, steps.index(answer.step)
+        self._open(client)
+
+    def _leave(self, client: Client) -> None:
+        if client.stream is not None:
+            self.engine.close(client.stream)
+        if client.place is not None:
+            self.admission.leave(client.place)
+
     def _open(self, client: Client) -> None:
-        ladder = Ladder(self._offer.steps(AUTO, block_s=BLOCK_S))
-        session = SimulatedSession(ladder.step)
+        ladder = Ladder(self._offer.steps(AUTO, block_s=BLOCK_S), client.began_at)
+        session = SimulatedSession(ladder.step, client.emitters)
         self._by_session[session] = client
         client.stream = Stream(
             session,
@@ -459,6 +529,10 @@ class SimulatedServer:
             lead=LEAD,
             deliver=lambda made: self._deliver(client, made),
         )
+        if client.place is not None:
+            self.admission.open(client.place, client.stream)
+            for _ in range(client.emitters):
+                assert self.admission.add_emitter(client.place, is_live=False) is None
         self.engine.open(client.stream)
         self._move(client, client.opened_s + self.began_s, 1)
 
@@ -487,7 +561,7 @@ class SimulatedServer:
         self._compute(
             future,
             cost_s,
-            ComputedResponse(request, cost_s, cost_s),
+            ComputedResponse(request, cost_s, cost_s / self.machine.speeds[-1]),
             is_urgent=is_urgent,
             note=lambda: self._note_answer(client),
         )
@@ -536,6 +610,7 @@ class SimulatedServer:
     def _post(self, call: Callable[[], None]) -> None:
         """As the event loop, for which each block is work."""
         cost_s, self._rendered = self._costs.send_s * max(1, self._rendered) * self._chance(), 0
+        self._loop_s += cost_s / max(self.machine.speeds)
         self.machine.send(cost_s, call)
 
     def _deliver(self, client: Client, made: list) -> None:
@@ -552,8 +627,9 @@ class SimulatedServer:
         streams = [client for client in self.clients if client.stream in self.engine.streams]
         for client in streams:
             at = client.stream.ladder.at
-            if at != (client.moves[-1][1] if client.moves else 0):
+            if at != (client.moves[-1][1] if client.moves else client.began_at):
                 client.moves.append((self.now_s, at))
+        self.admission.measure()
         period_s = THRESHOLDS.period_s
         steps = tuple(client.stream.ladder.at for client in streams)
         busy, self._busy_s = self._busy_s / period_s, 0.0

@@ -1,0 +1,389 @@
+"""How much room a server has, and whether one more stream or one more emitter fits without breaking anybody's sound.
+
+Everything here is a pure function of a `ServerLoad`: what the streams of each audio thread take, with newcomers at
+their expected cost, and what the event loop and the responses take. `server.streaming.admission` measures and acts.
+
+A newcomer fits if, with it,
+
+- its audio thread stays below the load at which streams step down, when it renders the most blocks at once;
+- the event loop keeps up;
+- audio threads, event loop and the least share for responses fit on the cores;
+- nobody waits longer for impulse responses (IRs) than the load policy allows: those on top of their ladders, who ask
+  for IRs as often as they like, and those below, who share a part of a core;
+- the first IRs of all newcomers delay those of the others by less than that.
+
+Shares are shares of one core. What audio threads take is stated *at one block at once*: `busy` converts it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+from server.streaming.load_policy import ir_share, patience_s
+from server.streaming.load_thresholds import Thresholds
+from server.streaming.quality_steps import QualityStep
+
+Scarce = Literal["streams", "rendering", "event_loop", "cores", "responses", "opening"]
+"""What there is too little of: streams (`max_streams`), time of an audio thread, of the event loop, of all cores
+together, of the workers for IRs, or of the workers for the first IRs of all that came just now."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Up to what load newcomers are let in, how they are counted, and for how long others are sent away."""
+
+    full_rendering: float = 0.78
+    """Busy share of an audio thread, at the most blocks at once, up to which newcomers are let in. It lies below
+    `full_busy`, from which on streams step down, by more than costs vary from one period to the next."""
+    full_loop: float = 0.7
+    """Share of a core that the event loop may take. It has to send every block as soon as that is ready."""
+    full_cores: float = 0.95
+    """Share of all cores that audio threads, the event loop and the least of responses may take together."""
+    saved_by_doubling: float = 0.1
+    """Share of a thread's time that doubling the blocks at once saves at least. The load policy's number is the largest
+    share; here too much trust would let too many in."""
+    full_patience: float = 0.5
+    """Share of the patience of the load policy that a wait for IRs may take: single waits are longer than the mean."""
+    full_workers: float = 0.5
+    """Share of the time left for IRs that streams on top of their ladders may ask for together for waits to be short.
+    Beyond it, each waits for one request of all others in turn."""
+    most_opening_s: float = 0.1
+    """Seconds for which the first IRs of newcomers may keep the workers. They go before all others, and two periods of
+    the load policy with long waits are one too many."""
+
+    poses_hz: float = 30.0
+    """Poses per second that a newcomer is expected to send, and with that the IRs that it asks for at its best."""
+    block_sent_s: float = 40e-6
+    """CPU seconds of the event loop for a block, until the server has measured its own."""
+    plan_s: float = 5e-3
+    """CPU seconds of a newcomer's first plan of effects, beside its first IRs."""
+    shown_after_s: float = 4.0
+    """Seconds after its last emitter for which a stream counts with its expected cost, if that is more than what it has
+    shown: first IRs, plans and the walk of the listener come meanwhile."""
+    reserved_s: float = 10.0
+    """Seconds for which a hello keeps room for the emitters that it announces."""
+    memory_s: float = 30.0
+    """Time constant with which a stream's highest cost is forgotten: a listener who pauses will walk on."""
+    least_correction: float = 0.5
+    """Least factor by which the cost of newcomers is corrected: streams at rest cost little, others may not rest."""
+    most_correction: float = 4.0
+    """Largest such factor."""
+    correction_weight: float = 0.05
+    """Weight of a quarter of a second in that factor."""
+
+    least_retry_s: float = 2.0
+    """Shortest time after which a refused client is asked to come back, but for newcomers that came all at once."""
+    most_retry_s: float = 60.0
+    """Longest such time: a place that becomes free should not stay empty for minutes."""
+    usual_stay_s: float = 30.0
+    """Time until a stream ends, as long as none has ended lately."""
+    endings: int = 16
+    """Streams that have ended last, by which that time is estimated."""
+    ending_memory_s: float = 600.0
+    """Seconds after which an ending says nothing any more."""
+
+
+LIMITS: Final = Limits()
+
+
+@dataclass(frozen=True)
+class RenderCost:
+    """CPU seconds to render: a block of a stream, and of each of its emitters, and the exchange of one IR."""
+
+    block_s: float
+    emitter_s: float
+    exchange_s: float
+
+    def share(self, *, emitters: int, rate_hz: float, block_s: float) -> float:
+        """Return the share of a core for blocks of `block_s`, with `rate_hz` IRs per second and emitter."""
+        return (self.block_s + emitters * self.emitter_s) / block_s + emitters * rate_hz * self.exchange_s
+
+
+@dataclass(frozen=True)
+class StreamKind:
+    """What streams of one scene, block length and output cost on this host. `render` has the costs of each quality
+    level, and `walk` the mean cost of an IR on a walk as a share of that of one for which no other can be reused; `key`
+    identifies the kind."""
+
+    key: tuple[str, int, int | None]
+    block_s: float
+    render: Mapping[str, RenderCost]
+    walk: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What streams really cost, as factors of what was expected of them."""
+
+    rendering: float = 1.0
+    requests: float = 1.0
+
+
+@dataclass(frozen=True)
+class StreamCost:
+    """What a stream takes: `rendering` as a share of a core at one block at once, `loop` as a share of the event loop,
+    and `rate_hz` requests for IRs per second of `request_s` CPU seconds each, for which it waits `patience_s`.
+    `opening_s` is the CPU time of its first IRs. A stream that `is_top` is on top of its ladder; one that `is_live`
+    gets one block at a time."""
+
+    rendering: float
+    loop: float = 0.0
+    request_s: float = 0.0
+    rate_hz: float = 0.0
+    patience_s: float = math.inf
+    opening_s: float = 0.0
+    is_top: bool = False
+    is_live: bool = False
+
+    @property
+    def demand(self) -> float:
+        """Share of a core that its IRs take if it gets all that it asks for."""
+        return self.request_s * self.rate_hz
+
+
+def expected_cost(
+    limits: Limits,
+    thresholds: Thresholds,
+    kind: StreamKind,
+    step: QualityStep,
+    *,
+    emitters: int,
+    correction: Correction = Correction(),
+    block_sent_s: float | None = None,
+    is_top: bool = False,
+    is_live: bool = False,
+) -> StreamCost:
+    """Return what a stream of a kind is expected to take on a quality step, while its listener walks."""
+    rate_hz = limits.poses_hz if step.ir_rate_hz is None else min(limits.poses_hz, step.ir_rate_hz)
+    share = kind.render[step.level].share(emitters=emitters, rate_hz=rate_hz, block_s=kind.block_s)
+    new_s = emitters * step.cost_ms / 1000
+    request_s = new_s * kind.walk.get(step.level, 1.0) * correction.requests
+    return StreamCost(
+        rendering=share * correction.rendering,
+        loop=(limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
+        request_s=request_s,
+        rate_hz=rate_hz,
+        patience_s=patience_s(thresholds, step),
+        opening_s=new_s + limits.plan_s,
+        is_top=is_top,
+        is_live=is_live,
+    )
+
+
+@dataclass(frozen=True)
+class ThreadLoad:
+    """What the `streams` of an audio thread take at one block at once: those that can be rendered `ahead`, and those
+    that play live samples."""
+
+    ahead: float = 0.0
+    live: float = 0.0
+    streams: int = 0
+
+    def plus(self, cost: StreamCost) -> "ThreadLoad":
+        live = cost.rendering if cost.is_live else 0.0
+        return ThreadLoad(self.ahead + cost.rendering - live, self.live + live, self.streams + 1)
+
+    def minus(self, cost: StreamCost) -> "ThreadLoad":
+        live = cost.rendering if cost.is_live else 0.0
+        return ThreadLoad(max(0.0, self.ahead - cost.rendering + live), max(0.0, self.live - live), self.streams - 1)
+
+
+@dataclass(frozen=True)
+class ServerLoad:
+    """What all streams take. Of those on top of their ladders, `demand` is the share of a core for all their requests
+    for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
+    below, `eased_demand` is the share of a core. `opening_s` is the CPU time of first IRs that are still to be
+    computed."""
+
+    threads: tuple[ThreadLoad, ...]
+    cores: int
+    workers: int
+    loop: float = 0.0
+    demand: float = 0.0
+    round_s: float = 0.0
+    patience_s: float = math.inf
+    eased_demand: float = 0.0
+    opening_s: float = 0.0
+    most_streams: int = 1
+
+    @property
+    def streams(self) -> int:
+        return sum(thread.streams for thread in self.threads)
+
+    def plus(self, thread: int, cost: StreamCost) -> "ServerLoad":
+        """Return the load with one more stream on a thread."""
+        return replace(
+            self._with(thread, self.threads[thread].plus(cost), cost, 1),
+            patience_s=min(self.patience_s, cost.patience_s) if cost.is_top else self.patience_s,
+            opening_s=self.opening_s + cost.opening_s,
+        )
+
+    def minus(self, thread: int, cost: StreamCost) -> "ServerLoad":
+        """Return the load without a stream of a thread; patience and first IRs stay as they are."""
+        return self._with(thread, self.threads[thread].minus(cost), cost, -1)
+
+    def _with(self, number: int, thread: ThreadLoad, cost: StreamCost, sign: int) -> "ServerLoad":
+        top, eased = (cost.demand, 0.0) if cost.is_top else (0.0, cost.demand)
+        return replace(
+            self,
+            threads=(*self.threads[:number], thread, *self.threads[number + 1 :]),
+            loop=max(0.0, self.loop + sign * cost.loop),
+            demand=max(0.0, self.demand + sign * top),
+            round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
+            eased_demand=max(0.0, self.eased_demand + sign * eased),
+        )
+
+
+def saving(limits: Limits, blocks: int) -> float:
+    """Return the factor of a thread's time at so many blocks at once."""
+    return float((1 - limits.saved_by_doubling) ** math.log2(blocks))
+
+
+def busy(limits: Limits, thread: ThreadLoad, blocks: int) -> float:
+    """Return the busy share of a thread at so many blocks at once."""
+    return thread.live + thread.ahead * saving(limits, blocks)
+
+
+def blocks_needed(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> int:
+    """Return how many blocks at once the load policy comes to under a steady load."""
+    *fewer, most = thresholds.blocks_at_once
+    for blocks, above in zip(fewer, thresholds.more_blocks_above, strict=True):
+        if busy(limits, thread, blocks) <= above:
+            return blocks
+    return most
+
+
+def spare_cores(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that audio threads, the event loop and plans of effects leave to everything else."""
+    threads = sum(_settled(limits, thresholds, thread) for thread in load.threads)
+    return max(0.0, load.cores - threads - load.loop - _plans(thresholds, load))
+
+
+def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
+    """Return what there is too little of for one more stream on a thread; None if it fits. A stream that has the server
+    to itself always fits, since it can only break its own sound."""
+    if load.streams >= load.most_streams:
+        return "streams"
+    if load.streams == 0:
+        return None
+    return _scarce(limits, thresholds, load.plus(thread, cost), thread, cost)
+
+
+def obstacle_to_change(
+    limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, before: StreamCost, after: StreamCost
+) -> Scarce | None:
+    """Return what there is too little of for a stream of a thread to cost `after` in place of `before`; None if the
+    change fits, as any does that makes nothing dearer."""
+    if load.streams <= 1:
+        return None
+    dearer = after.rendering > before.rendering or after.demand > before.demand or after.is_live > before.is_live
+    if not dearer:
+        return None
+    changed = load.minus(thread, before).plus(thread, after)
+    return _scarce(limits, thresholds, changed, thread, after)
+
+
+def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
+    """Return what there is too little of under a load that includes the newcomer's `cost`."""
+    if busy(limits, load.threads[thread], thresholds.blocks_at_once[-1]) > limits.full_rendering:
+        return "rendering"
+    if load.loop > limits.full_loop:
+        return "event_loop"
+    if _cores_needed(limits, thresholds, load) > limits.full_cores * load.cores:
+        return "cores"
+    if cost.request_s == 0:
+        return None
+    spare = min(float(load.workers), spare_cores(limits, thresholds, load))
+    if not _waits_are_short(limits, thresholds, load, spare):
+        return "responses"
+    if cost.is_top:
+        # It keeps its step when the server is full.
+        is_lasting = _waits_are_short(limits, thresholds, load, min(spare, _spare_when_full(limits, thresholds, load)))
+    else:
+        share = ir_share(thresholds, busy=_settled(limits, thresholds, load.threads[thread]))
+        interval_s = cost.request_s * load.threads[thread].streams / share
+        is_lasting = interval_s <= 1 / thresholds.least_ir_rate_hz
+    if not is_lasting:
+        return "responses"
+    return "opening" if load.opening_s > limits.most_opening_s * spare else None
+
+
+def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> float:
+    """Return the busy share of a thread at the blocks at once that it comes to."""
+    return busy(limits, thread, blocks_needed(limits, thresholds, thread))
+
+
+def _spare_when_full(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that are left when the audio threads render as much as they may."""
+    rendering = min(limits.full_rendering * len(load.threads), limits.full_cores * load.cores - load.loop)
+    return max(0.0, load.cores - rendering - load.loop - _plans(thresholds, load))
+
+
+def _plans(thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that plans of effects take at most."""
+    return thresholds.plan_share * sum(thread.streams > 0 for thread in load.threads)
+
+
+def _waits_are_short(limits: Limits, thresholds: Thresholds, load: ServerLoad, spare: float) -> bool:
+    """Return whether streams on top of their ladders get their IRs in time from so many `spare` cores, of which those
+    below have their share. If there is time for all requests, a stream waits for little more than its own; if not, for
+    one of each stream in turn."""
+    if not load.round_s:
+        return True
+    shared = sum(
+        ir_share(thresholds, busy=_settled(limits, thresholds, thread)) for thread in load.threads if thread.streams
+    )
+    left = spare - min(load.eased_demand, shared)
+    if left <= 0:
+        return False
+    most_s = limits.full_patience * load.patience_s * left
+    return load.round_s <= most_s or load.demand <= limits.full_workers * left
+
+
+def _cores_needed(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the cores that may not be missing: for blocks at the most at once, the event loop and the least share for
+    IRs of each thread with streams."""
+    most = thresholds.blocks_at_once[-1]
+    least = thresholds.ir_share * thresholds.least_ir_share * sum(thread.streams > 0 for thread in load.threads)
+    threads = sum(busy(limits, thread, most) for thread in load.threads)
+    return threads + load.loop + min(least, load.demand + load.eased_demand)
+
+
+def freest_thread(limits: Limits, load: ServerLoad) -> int:
+    """Return the number of the thread with the least to do."""
+    return min(range(len(load.threads)), key=lambda number: busy(limits, load.threads[number], 1))
+
+
+def headroom(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
+    """Return the share of the server that is still free, from 0 (nobody else fits) to 1 (nobody is there), of what is
+    scarcest: time of all audio threads, of the event loop, of all cores, or streams."""
+    most = thresholds.blocks_at_once[-1]
+    rendering = sum(busy(limits, thread, most) for thread in load.threads) / len(load.threads)
+    taken = (
+        rendering / limits.full_rendering,
+        load.loop / limits.full_loop,
+        _cores_needed(limits, thresholds, load) / (limits.full_cores * load.cores),
+        load.streams / load.most_streams,
+    )
+    return max(0.0, 1 - max(taken))
+
+
+def seconds_to_next_ending(limits: Limits, endings_s: Sequence[float], now_s: float, *, streams: int) -> float:
+    """Return how long it takes on average until a stream ends, of so many that are open, judged by when the last ones
+    ended."""
+    lately = [ended_s for ended_s in endings_s if now_s - ended_s <= limits.ending_memory_s]
+    if not lately:
+        return limits.usual_stay_s / max(1, streams)
+    # A long time without any ending counts too.
+    return (now_s - min(lately)) / len(lately)
+
+
+def retry_after_s(limits: Limits, *, next_ending_s: float, waiting: int, luck: float) -> int:
+    """Return after how many whole seconds a refused client should come back. `waiting` clients were refused lately and
+    will come back too; `luck`, evenly distributed from 0 to 1, spreads them over the time in which that many streams
+    end."""
+    first_s = max(limits.least_retry_s, next_ending_s)
+    spread_s = max(limits.least_retry_s, waiting * next_ending_s)
+    half_s = limits.most_retry_s / 2
+    return math.ceil(min(half_s, first_s) + luck * min(half_s, spread_s))

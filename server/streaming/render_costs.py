@@ -1,0 +1,138 @@
+"""What rendering a stream costs on this host: CPU time of a block, of each emitter in it, and of an exchange of an
+impulse response (IR). It is measured in a tenth of a second with sessions of one emitter and of several, whose listener
+moves."""
+
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import Final
+
+import numpy as np
+
+from server.acoustics.geometry import Vector3
+from server.acoustics.spherical_harmonics import harmonic_count
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.rendering.hrtf import HeadFilters
+from server.rendering.ingest import DryAudio
+from server.responses.ir_request import IrResponse, compute_irs
+from server.scene.manifest import QualityLevel
+from server.streaming.headroom import RenderCost, StreamKind
+from server.streaming.quality_steps import QualityStep
+from server.streaming.session import Session
+
+BLOCK_SIZE: Final = 256
+"""The length of the blocks that are measured."""
+_EMITTERS = 8
+_BLOCKS = 16
+_ROUNDS = 4
+_CLIP_SAMPLES = 8_192
+
+
+def measure_rendering(
+    levels: FieldsByLevel, filters: HeadFilters, *, time_s: Callable[[], float] = time.thread_time
+) -> dict[str, RenderCost]:
+    """Return the costs of streams for two ears in blocks of `BLOCK_SIZE`, by level. Levels that are rendered in the
+    same way are measured once. `time_s` is the CPU time of this thread, so that other load has little influence."""
+    ways: dict[Hashable, list[str]] = {}
+    for name, field in levels.items():
+        ways.setdefault((field.level.shared_tail, field.level.bus), []).append(name)
+    costs: dict[str, RenderCost] = {}
+    for names in ways.values():
+        few, many = (_time_blocks(levels, filters, names[0], count, time_s) for count in (1, _EMITTERS))
+        emitter_s = max(0.0, (many[0] - few[0]) / (_EMITTERS - 1))
+        cost = RenderCost(max(0.0, few[0] - emitter_s), emitter_s, max(0.0, many[1] / _EMITTERS))
+        costs |= dict.fromkeys(names, cost)
+    return costs
+
+
+def kind_of(
+    levels: FieldsByLevel, costs: Mapping[str, RenderCost], *, block_size: int, order: int | None = None
+) -> StreamKind:
+    """Return the kind of a scene's streams in blocks of another length, or of ambisonic channels: an emitter's cost is
+    taken to grow with its samples, and with its channels. What such streams really cost corrects it."""
+    samples = block_size / BLOCK_SIZE
+    channels = 1.0 if order is None else max(1.0, harmonic_count(order) / 2)
+    scaled = {
+        name: RenderCost(cost.block_s, cost.emitter_s * samples * channels, cost.exchange_s * channels)
+        for name, cost in costs.items()
+    }
+    walk = {name: _walk_share(field.level) for name, field in levels.items()}
+    return StreamKind((levels.bundle.id, block_size, order), block_size / levels.default.sample_rate, scaled, walk)
+
+
+def _walk_share(level: QualityLevel) -> float:
+    """Return the mean cost of an IR on a walk as a share of that of one that cannot be reused, where it is known."""
+    if level.cost is None or not level.cost.ms_miss:
+        return 1.0
+    return min(1.0, level.cost.ms_mean / level.cost.ms_miss)
+
+
+def _time_blocks(
+    levels: FieldsByLevel, filters: HeadFilters, level: str, emitters: int, time_s: Callable[[], float]
+) -> tuple[float, float]:
+    """Return the CPU seconds of a block while the listener moves, and what an exchange of the IRs of all emitters
+    adds."""
+    walk = _Walk(levels, filters, level, emitters)
+    plain, exchanging = [], []
+    for turn in range(_ROUNDS + 1):
+        began_s = time_s()
+        walk.play(_BLOCKS)
+        between_s = time_s()
+        computed = walk.compute()
+        ready_s = time_s()
+        walk.exchange(computed)
+        walk.play(_BLOCKS)
+        ended_s = time_s()
+        if turn:  # the first is a warm-up
+            plain.append((between_s - began_s) / _BLOCKS)
+            exchanging.append(ended_s - ready_s)
+    # The shortest times: whatever else disturbs a round only adds to it.
+    block_s = min(plain)
+    return block_s, max(0.0, min(exchanging) - _BLOCKS * block_s)
+
+
+class _Walk:
+    """A session whose listener takes a step with each block."""
+
+    def __init__(self, levels: FieldsByLevel, filters: HeadFilters, level: str, emitters: int) -> None:
+        field = levels[level]
+        start = levels.bundle.manifest.start
+        clip = DryAudio(0.1 * np.random.default_rng(0).standard_normal(_CLIP_SAMPLES))
+        self._levels = levels
+        self._session = Session(
+            Hello(protocol=PROTOCOL, scene=levels.bundle.id, block_size=BLOCK_SIZE),
+            levels,
+            filters,
+            lambda _: clip,
+            quality=QualityStep.full(field.level, 1.0),
+            max_emitters=emitters,
+            window=2 * (_ROUNDS + 2) * _BLOCKS,
+        )
+        for number in range(emitters):
+            self._session.receive(AddEmitter(id=str(number), clip="noise", position=start.emitter))
+        self._places: tuple[Vector3, Vector3] = start.listener, start.emitter
+        self._pose_id = 0
+        self._move()
+        self.exchange(self.compute())
+        self._session.render_block()
+
+    def play(self, blocks: int) -> None:
+        for _ in range(blocks):
+            self._move()
+            self._session.render_block()
+
+    def compute(self) -> IrResponse | None:
+        request = self._session.take_request()
+        return None if request is None else compute_irs(self._levels, request, self._session.renderer)
+
+    def exchange(self, computed: IrResponse | None) -> None:
+        if computed is not None:
+            self._session.accept(computed)
+
+    def _move(self) -> None:
+        """Go to and fro on the way from the listener's place to the emitter's."""
+        self._pose_id += 1
+        share = 0.3 + 0.2 * np.sin(0.3 * self._pose_id)
+        here, there = (np.asarray(place) for place in self._places)
+        x, y, z = (float(part) for part in here + share * (there - here))
+        self._session.receive(ListenerPose(pose_id=self._pose_id, position=(x, y, z), yaw=0.05 * self._pose_id))
