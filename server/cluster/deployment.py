@@ -41,12 +41,10 @@ def threads_of(cores: float) -> dict[str, int]:
     return {name: value for name, value in usual.items() if f"NAFIR_{name}".upper() not in os.environ}
 
 
-@serve.deployment(name="nafir")
-@serve.ingress()
 class Replica:
-    """One replica. Ray Serve calls its methods on the application's event loop."""
+    """One replica. Ray Serve makes it, and calls its methods, on the application's event loop."""
 
-    async def __init__(self) -> None:
+    def __init__(self) -> None:
         cores = ray.get_runtime_context().get_assigned_resources().get("CPU", 1)
         self._app = ReplicaApp(settings_of(threads_of(cores)))
         self._watch = asyncio.create_task(self._drain_in_time())
@@ -67,4 +65,5 @@ class Replica:
         self._app.require_working()
 
 
-application: Any = Replica.bind()
+deployment: Any = serve.deployment(name="nafir")(serve.ingress()(Replica))
+application: Any = deployment.bind()

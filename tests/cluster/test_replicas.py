@@ -17,7 +17,7 @@ from ray import serve
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from server.cluster.deployment import Replica
+from server.cluster.deployment import deployment
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello
 from tests.ray_nodes import ray_nodes
@@ -76,7 +76,7 @@ async def until(condition) -> None:
 
 def deployed(replicas: int):
     settings = {"NAFIR_REALTIME": "false", "NAFIR_MAX_STREAMS": str(2 * STREAMS)}
-    return Replica.options(
+    return deployment.options(
         num_replicas=replicas,
         max_ongoing_requests=1000,
         graceful_shutdown_wait_loop_s=0.2,

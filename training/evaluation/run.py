@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def evaluate_bundles(
 @contextmanager
 def _stored(keep: Path | None, comparison: Comparison, names: list[str], draws: int) -> Iterator[StoredErrors]:
     """The errors that are stored in a file, or in a temporary one."""
-    depends_on = [comparison.files(), names, comparison.pairs, comparison.yaws, comparison.half, draws]
+    depends_on: list[Any] = [comparison.files(), names, comparison.pairs, comparison.yaws, comparison.half, draws]
     depends_on += [comparison.seed, comparison.tilt_deg, str(comparison.hrtf)]
     if keep is not None:
         yield StoredErrors(keep, depends_on)

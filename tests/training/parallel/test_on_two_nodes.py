@@ -42,7 +42,7 @@ class Fatal(Progress):
     def advance(self, *_, **__):
         self.steps -= 1
         if not self.steps:
-            self.cluster.remove_node(max(self.cluster.worker_nodes, key=str), allow_graceful=False)
+            self.cluster.remove_node(next(iter(self.cluster.worker_nodes)), allow_graceful=False)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_scene_has_equal_hashes_although_a_node_was_killed(dataset, tiny_scene
     monkeypatch.setattr(Dataset, "write", counted)
     with ray_nodes(1, 1) as nodes, open_jobs(nodes.address, threads=1) as jobs:
         made = simulate(tiny_scene, tmp_path / "data", seed=dataset.seed, jobs=jobs, progress=Fatal(nodes, 2))
-        assert len(nodes.worker_nodes) == 1
+        assert not nodes.worker_nodes
     assert written == dict.fromkeys(range(len(dataset.probes)), 1)
     assert digests(made) == digests(dataset)
 
