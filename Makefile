@@ -50,7 +50,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: long mutants attacks docs docs-serve results lock
+.PHONY: cluster-test long mutants attacks docs docs-serve results lock
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
 help: ## show this list
@@ -60,8 +60,8 @@ serve: $(VENV)/installed-server ## install the server and open a scene at http:/
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
 
 test: lint ## install what tests need, then lint, check types and run all tests but the long
-	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long'
-	$(BIN)/pytest $(TIMED) -m 'timed and not attack'
+	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long and not cluster'
+	$(BIN)/pytest $(TIMED) -m 'timed and not attack and not cluster'
 
 lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .
@@ -110,6 +110,9 @@ long: $(VENV)/installed-dev ## tests that take very long for what they may find:
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
 	$(BIN)/pytest -m attack
+
+cluster-test: $(VENV)/installed-cluster ## install Ray, start two nodes of it here and end one of them: scenes, training and streams
+	$(BIN)/pytest -m cluster
 
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
@@ -251,3 +254,8 @@ $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[dev]'
 	@$(BYTECODE)
 	@touch $(VENV)/installed-server $(VENV)/installed-training $@
+
+$(VENV)/installed-cluster: pyproject.toml | $(VENV)/installed-dev
+	@echo "Installing Ray into $(VENV), once ..."
+	$(PIP) --editable '.[dev,cluster]'
+	@touch $@

@@ -43,11 +43,16 @@ def _compile_rendering() -> None:
 def _compile_simulation() -> None:
     from rich.progress import Progress
 
+    from training.parallel.jobs import LocalJobs
     from training.simulation.run import simulate
 
     with tempfile.TemporaryDirectory() as folder:
         simulate(
-            ROOT / "tests/data/tiny.toml", Path(folder) / "data", seed=5, workers=1, progress=Progress(disable=True)
+            ROOT / "tests/data/tiny.toml",
+            Path(folder) / "data",
+            seed=5,
+            jobs=LocalJobs(1),
+            progress=Progress(disable=True),
         )
 
 

@@ -23,6 +23,7 @@ from training.data.scene_file import SceneFile
 from training.learning.runs import Configuration
 from training.learning.train import train
 from training.models.encoders import FieldShape
+from training.parallel.jobs import LocalJobs
 from training.simulation import planner
 from training.simulation.predictions import Predictions
 from training.simulation.responses import SimulatedResponses
@@ -111,7 +112,7 @@ def _tried_once() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Dataset:
     folder = tmp_path_factory.mktemp("tiny") / "data"
-    return simulate(TINY, folder, seed=5, workers=1, progress=Progress(disable=True))
+    return simulate(TINY, folder, seed=5, jobs=LocalJobs(1), progress=Progress(disable=True))
 
 
 @pytest.fixture(scope="session")

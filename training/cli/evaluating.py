@@ -13,7 +13,7 @@ from rich.console import Console
 from server.core.command_line import figure_file, require_at_most_one, writable_file, writable_folder
 from server.core.files import require_matplotlib, require_writable
 from server.core.numerals import parse_decimal
-from training.cli.options import Json, Seed, progress_bar
+from training.cli.options import Cluster, Json, Seed, progress_bar
 
 if TYPE_CHECKING:
     from training.baselines.held_out import HeldOut
@@ -57,6 +57,7 @@ def evaluate(
     ] = None,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
     seed: Seed = 0,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Measure errors on held-out pairs, storage and time of fields, beside baselines and the repeatability floor."""
@@ -68,6 +69,7 @@ def evaluate(
     from training.evaluation.fields import record_accuracy
     from training.evaluation.report import markdown, report
     from training.evaluation.run import evaluate_bundles
+    from training.parallel.jobs import open_jobs
 
     require_at_most_one({"--json": as_json, "--markdown": as_markdown})
     chosen = next((known for known in get_args(Half) if known == half), None)
@@ -84,22 +86,24 @@ def evaluate(
     if record:
         require_writable(bundles[0].folder / MANIFEST_FILE, "--record")
     console = Console(stderr=True)
-    evaluation, published = evaluate_bundles(
-        bundles,
-        places[-1],
-        runs=runs,
-        methods=[name.strip() for name in methods.split(",") if name.strip()],
-        pairs=pairs,
-        yaws=yaws,
-        half=chosen,
-        draws=draws,
-        hrtf=hrtf,
-        tilt_deg=tilt,
-        seed=seed,
-        figure=figure,
-        keep=None if output is None else Path(f"{output}.partial"),
-        track=lambda steps, doing: track(steps, doing, console=console),
-    )
+    with open_jobs(cluster, threads=os.cpu_count() or 1) as jobs:
+        evaluation, published = evaluate_bundles(
+            bundles,
+            places[-1],
+            runs=runs,
+            methods=[name.strip() for name in methods.split(",") if name.strip()],
+            pairs=pairs,
+            yaws=yaws,
+            half=chosen,
+            draws=draws,
+            hrtf=hrtf,
+            tilt_deg=tilt,
+            seed=seed,
+            figure=figure,
+            keep=None if output is None else Path(f"{output}.partial"),
+            jobs=jobs,
+            track=lambda steps, doing: track(steps, doing, console=console),
+        )
     if record:
         record_accuracy(bundles[0], evaluation)
     if output is not None:

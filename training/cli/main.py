@@ -18,7 +18,7 @@ from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
 from training.cli.importing import importing
 from training.cli.listening import listening_test
-from training.cli.options import Json, Seed
+from training.cli.options import Cluster, Json, Seed
 from training.cli.options import progress_bar as _progress
 
 if TYPE_CHECKING:
@@ -39,18 +39,20 @@ def simulate(
     effects: simulation.Effects = "plan",
     seed: Seed = 0,
     workers: Annotated[int, typer.Option(min=0, help="Threads; 0 for one per core.")] = 0,
+    cluster: Cluster = None,
 ) -> None:
     """Simulate what a scene calls for, between all pairs of probes. Run again after an interruption to go on."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from training.parallel.jobs import open_jobs
     from training.simulation.run import simulate as simulate_scene
 
+    require_at_most_one({"--workers": workers > 0, "--cluster": cluster is not None})
     console = simulation.wide_console(stderr=True)
     with console.status("planning, and tracing the late sound that pairs may share"):
         ready = simulation.simulation_of(scene, seed, effects)
     simulation.print_plan(console, ready.scene, ready.plan)
-    processes = workers or os.cpu_count() or 1
-    with _progress() as progress:
-        dataset = simulate_scene(scene, output, seed=seed, workers=processes, progress=progress, simulation=ready)
+    with open_jobs(cluster, threads=workers or os.cpu_count() or 1) as jobs, _progress() as progress:
+        dataset = simulate_scene(scene, output, seed=seed, jobs=jobs, progress=progress, simulation=ready)
     from training.simulation.responses import SimulatedResponses
 
     _print_findings(SimulatedResponses(dataset))
@@ -96,6 +98,10 @@ def train(
     teacher: Annotated[
         Path | None, typer.Option(help="Run folder of a naf on the same data, for a factorised field to learn from.")
     ] = None,
+    cluster: Cluster = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes on the cluster, of a core each; 2 if not given.")
+    ] = None,
 ) -> None:
     """Train a field on a dataset. Run again after an interruption to go on; with torchrun, in several processes."""
     # Targets need many small matrix products, where threads of OpenBLAS wait for each other. Torch has its own threads.
@@ -104,6 +110,8 @@ def train(
     from training.learning.train import train as train_field
     from training.simulation.responses import open_responses
 
+    if workers is not None and cluster is None:
+        raise NafirError("--workers: are processes on a cluster: name it by --cluster")
     lengths = {"--epochs": epochs, "--minutes": minutes, "--as-long-as": as_long_as}
     require_at_most_one({option: value is not None for option, value in lengths.items()})
     if as_long_as is not None:
@@ -123,8 +131,14 @@ def train(
     responses = open_responses(data)
     if os.environ.get("RANK", "0") == "0":
         _print_findings(responses)
-    with _progress() as progress:
-        train_field(responses, output, configuration, progress)
+    if cluster is None:
+        with _progress() as progress:
+            train_field(responses, output, configuration, progress)
+    else:
+        from training.learning.on_cluster import train_on_cluster
+
+        with Console(stderr=True).status("training on the cluster"):
+            train_on_cluster(cluster, data, output, configuration, workers=workers or 2)
     typer.echo(f"{output}: {configuration.name} is trained")
 
 
@@ -136,6 +150,7 @@ def ablate(
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the training set, of every run.")] = 14,
     teacher: Annotated[Path | None, typer.Option(help="Run folder of a naf on the same data, to learn from.")] = None,
     seed: Seed = 0,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Train the factorised field once per factor and compare errors on the held-out pairs. Run again to go on."""
@@ -144,12 +159,13 @@ def ablate(
     from training.evaluation.ablation import ablate as ablate_factors
     from training.evaluation.ablation import table, variants
     from training.learning.runs import configure
+    from training.parallel.jobs import open_jobs
     from training.simulation.responses import open_responses
 
     responses = open_responses(data)
     configurations = variants(configure("factorised", rank=rank, epochs=epochs, seed=seed), responses, teacher)
-    with _progress() as progress:
-        rows = ablate_factors(responses, output, configurations, progress)
+    with open_jobs(cluster, threads=1) as jobs, _progress() as progress:
+        rows = ablate_factors(responses, output, configurations, progress, jobs=jobs)
     if as_json:
         typer.echo(json.dumps([asdict(row) for row in rows], indent=2))
         return
@@ -286,6 +302,7 @@ def frontier(
     default_ms: Annotated[float, typer.Option(help="A response of the default level takes no longer.")] = 2.5,
     record: Annotated[bool, typer.Option(help="Write a few of the Pareto-optimal levels into the bundle.")] = False,
     seed: Seed = 0,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Measure accuracy against time for everything a bundle could offer. Run again after an interruption to go on."""
@@ -296,6 +313,7 @@ def frontier(
     from training.frontier.sweep import Effort, sweep
     from training.frontier.sweep import record as record_frontier
     from training.frontier.table import report
+    from training.parallel.jobs import open_jobs
 
     require_matplotlib("--output")
     if record:
@@ -303,8 +321,8 @@ def frontier(
     loaded = Bundle.load(bundle)
     effort = Effort(pairs=pairs, yaws=yaws, walk_s=walk_s, default_ms=default_ms, seed=seed)
     levels = candidates(loaded, phases_of, reuse_of or ())
-    with _progress() as progress:
-        measured = sweep(loaded, Dataset.open(data), levels, output, effort, progress)
+    with open_jobs(cluster, threads=os.cpu_count() or 1) as jobs, _progress() as progress:
+        measured = sweep(loaded, Dataset.open(data), levels, output, effort, progress, jobs=jobs)
     (output / "frontier.json").write_text(json.dumps(measured.to_json(), indent=2) + "\n")
     draw_frontier(measured, output / "frontier.png")
     if record:

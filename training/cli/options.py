@@ -10,6 +10,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
 
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run on the nodes of a Ray cluster: HOST:PORT, or auto on one of them. Needs the extra cluster.",
+    ),
+]
+
 
 def progress_bar() -> Progress:
     columns = (

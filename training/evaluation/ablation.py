@@ -5,6 +5,7 @@ responses themselves, in units that do not depend on how a run was trained.
 """
 
 from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from training.learning.runs import Configuration, FactorisedRecipe
 from training.learning.train import load_learner, train
 from training.models.factorised import ExportedField
 from training.models.targets import align, delay_samples
-from training.simulation.responses import SimulatedResponses
+from training.parallel.jobs import ALL_CORES, IsOver, Job, Jobs
+from training.simulation.responses import SimulatedResponses, open_responses
 
 _MOST_ROWS = 600
 _BATCH = 32
@@ -64,25 +66,67 @@ def variants(base: Configuration, responses: ResponseSet, teacher: Path | None) 
 
 
 def ablate(
-    responses: ResponseSet, folder: Path, configurations: dict[str, Configuration], progress: Progress
+    responses: ResponseSet,
+    folder: Path,
+    configurations: dict[str, Configuration],
+    progress: Progress,
+    *,
+    jobs: Jobs = ALL_CORES,
 ) -> list[Row]:
     """Train each configuration in its own folder, unless it is already trained, and measure the errors of all.
 
+    In this process that is one after the other, with all of torch's threads. With `jobs` on other nodes each
+    configuration is one of them, with as many threads as here, and the data and `folder` have the same paths there.
+
     Raises AblationError if no pair is held out.
     """
-    rows = np.flatnonzero(responses.held_out)
-    if not len(rows):
+    if not responses.held_out.any():
         raise AblationError("data: no pair is held out, so nothing can be measured; import them with a share held out")
-    rows = rows[:: -(-len(rows) // _MOST_ROWS)]
-    results = []
-    for name, configuration in configurations.items():
-        run = folder / name.replace(" ", "-")
-        train(responses, run, configuration, progress)
-        learner = load_learner(responses, run)
-        if not isinstance(learner, FactorisedLearner):
-            raise TypeError(f"{run} holds no factorised field")
-        results.append(Row(name, configuration, *_errors(learner, rows)))
-    return results
+    if not jobs.are_elsewhere:
+        return [_row(responses, folder, name, each, progress) for name, each in configurations.items()]
+    data, threads = responses.file.parent.resolve(), torch.get_num_threads()
+    variants = [
+        Job(f"data {data.name}, ablation {name!r}", _Variant(name, each)) for name, each in configurations.items()
+    ]
+    task = progress.add_task("training", total=len(variants))
+    found: dict[str, Row] = {}
+    with closing(jobs.run(_train, _Ablation(data, folder.resolve(), threads), variants, cores=threads)) as rows:
+        for variant, row in rows:
+            found[variant.name] = row
+            progress.advance(task)
+    return [found[name] for name in configurations]
+
+
+@dataclass(frozen=True)
+class _Ablation:
+    """Folders of the data and of the runs, and the number of torch's threads."""
+
+    data: Path
+    folder: Path
+    threads: int
+
+
+@dataclass(frozen=True)
+class _Variant:
+    name: str
+    configuration: Configuration
+
+
+def _train(ablation: _Ablation, variant: _Variant, _: IsOver) -> Row:
+    torch.set_num_threads(ablation.threads)
+    responses = open_responses(ablation.data)
+    return _row(responses, ablation.folder, variant.name, variant.configuration, Progress(disable=True))
+
+
+def _row(responses: ResponseSet, folder: Path, name: str, configuration: Configuration, progress: Progress) -> Row:
+    """Train a configuration, or go on with it, and measure its errors."""
+    run = folder / name.replace(" ", "-")
+    train(responses, run, configuration, progress)
+    learner = load_learner(responses, run)
+    if not isinstance(learner, FactorisedLearner):
+        raise TypeError(f"{run} holds no factorised field")
+    rows = np.flatnonzero(responses.held_out)
+    return Row(name, configuration, *_errors(learner, rows[:: -(-len(rows) // _MOST_ROWS)]))
 
 
 @torch.no_grad()

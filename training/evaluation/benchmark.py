@@ -188,7 +188,7 @@ class _Scoring:
 
     def of_case(self, number: int) -> tuple[_Rows, _Rows]:
         """Errors by metric, and facts about predictions and references, a value for each row."""
-        if self.stored is not None and (found := self.stored.get(number)) is not None:
+        if self.stored is not None and (found := self.stored.get(number)):
             return found[0], found[1]
         case = self.data.cases[number]
         truth = case.truth()
@@ -217,7 +217,7 @@ class _Scoring:
         # Bytes of a digest are small whole numbers.
         facts["sha256"] = np.array([[*hashlib.sha256(row.tobytes()).digest()] for row in truth], dtype=np.float64)
         if self.stored is not None:
-            self.stored.put(number, [errors, facts])
+            self.stored.put(number, {0: errors, 1: facts})
         return errors, facts
 
 

@@ -17,8 +17,8 @@ import hashlib
 import json
 import os
 import warnings
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +29,27 @@ from server.acoustics.room_parameters import RoomParameters, measure
 from training.baselines.coded import Track
 from training.baselines.held_out import EvaluationError, HeldOut
 from training.data.dataset import TAKES, Dataset
+from training.parallel.jobs import ALL_CORES, IsOver, Job, Jobs
 from training.simulation.pairs import PairSimulation
 from training.simulation.references import GeometricSound
 
 _FOLDER = "draws"
 _FORMAT = 3
 """This number must change whenever simulations, or the parameters measured in them, change."""
-_WORKERS = 2
 # With 20,000 rays, the reverberation time of a small room has an error of 0.9 %, the same for all pairs.
 _TAIL_RAYS = 16
 _NAMES = tuple(field.name for field in fields(RoomParameters))
 _Floats = npt.NDArray[np.float64]
+_Parameters = dict[str, _Floats]
 
 
 def median_parameters(
-    held_out: HeldOut, draws: int, *, decay_db: float = 30.0, track: Track = lambda steps, _: steps
+    held_out: HeldOut,
+    draws: int,
+    *,
+    decay_db: float = 30.0,
+    jobs: Jobs = ALL_CORES,
+    track: Track = lambda steps, _: steps,
 ) -> list[RoomParameters]:
     """The parameters of each held-out pair at the evaluated orientations: medians over `draws` simulations, none of
     which is in the dataset. A value that cannot be measured in more than half of the draws is missing.
@@ -54,7 +60,7 @@ def median_parameters(
     if dataset is None:
         raise EvaluationError("--draws: what was measured cannot be drawn again; leave it out")
     ends = [divmod(int(pair), len(dataset.probes)) for pair in held_out.held_out]
-    medians = _Draws(dataset, decay_db).medians(sorted({emitter for emitter, _ in ends}), draws, track)
+    medians = _Draws(dataset, decay_db, jobs).medians(sorted({emitter for emitter, _ in ends}), draws, track)
     return [
         RoomParameters(**{name: values[held_out.yaw_indices] for name, values in medians[emitter, listener].items()})
         for emitter, listener in ends
@@ -65,11 +71,10 @@ class _Draws:
     """Simulates draws for one dataset and stores their parameters. Responses are complete; decay times are measured
     over `decay_db`."""
 
-    def __init__(self, dataset: Dataset, decay_db: float) -> None:
+    def __init__(self, dataset: Dataset, decay_db: float, jobs: Jobs) -> None:
         self._dataset = dataset
         self._decay_db = decay_db
-        self._geometric = GeometricSound(dataset)
-        self._simulations: dict[int, PairSimulation] = {}
+        self._jobs = jobs
         self._plan = replace(dataset.effects, tail_rays=_TAIL_RAYS * dataset.effects.tail_rays)
         simulated = hashlib.sha256((dataset.folder / "scene.toml").read_bytes())
         simulated.update(json.dumps([_FORMAT, dataset.seed, self._plan.to_json(), decay_db, _NAMES]).encode())
@@ -86,13 +91,9 @@ class _Draws:
         for emitter in emitters:
             drawn = [np.load(self._file(draw, emitter)) for draw in range(draws)]
             medians = {name: _median(np.stack([parameters[name] for parameters in drawn])) for name in _NAMES}
-            for row, listener in enumerate(self._listeners(emitter)):
-                of_pairs[emitter, listener] = {name: values[row] for name, values in medians.items()}
+            for row, listener in enumerate(_listeners(self._dataset, emitter)):
+                of_pairs[emitter, int(listener)] = {name: values[row] for name, values in medians.items()}
         return of_pairs
-
-    def _listeners(self, emitter: int) -> list[int]:
-        """All held-out listeners of an emitter, even if only some are evaluated."""
-        return [int(listener) for listener in np.flatnonzero(self._dataset.held_out[emitter])]
 
     def _file(self, draw: int, emitter: int) -> Path:
         return self._folder / f"{draw}-{emitter}.npz"
@@ -100,33 +101,56 @@ class _Draws:
     def _simulate(self, steps: list[tuple[int, int]], track: Track) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         dataset = self._dataset
-        for number in sorted({draw // len(TAKES) for draw, _ in steps}):
-            self._simulations[number] = PairSimulation.prepare(
+        numbers = sorted({draw // len(TAKES) for draw, _ in steps})
+        simulations = {
+            number: PairSimulation.prepare(
                 dataset.scene, dataset.probes, dataset.yaws, seed=dataset.seed + 1 + number, plan=self._plan
             )
-        # The compiled code, which takes most of the time, releases the interpreter's lock.
-        pool = ThreadPoolExecutor(_WORKERS, "draw")
-        try:
-            results = pool.map(self._draw, steps)
-            for _ in zip(track(range(len(steps)), "drawing references"), results, strict=True):
-                pass
-        finally:
-            pool.shutdown(cancel_futures=True)
+            for number in numbers
+        }
+        drawing = _Drawing(dataset, GeometricSound(dataset), simulations, self._decay_db)
+        jobs = [
+            Job(f"scene {dataset.scene.id}, emitter {emitter}, draw {draw}", (draw, emitter)) for draw, emitter in steps
+        ]
+        with closing(self._jobs.run(_draw, drawing, jobs)) as drawn:
+            for _, (step, parameters) in zip(track(range(len(steps)), "drawing references"), drawn, strict=True):
+                self._write(step, parameters)
 
-    def _draw(self, step: tuple[int, int]) -> None:
-        draw, emitter = step
-        number, take = divmod(draw, len(TAKES))
-        simulation = self._simulations[number]
-        measured = []
-        for listener, _, late in simulation.take(emitter, np.array(self._listeners(emitter)), take):
-            response = self._geometric.complete(emitter, listener, late)
-            measured.append(vars(measure(response, self._dataset.sample_rate, decay_db=self._decay_db)))
-        path = self._file(draw, emitter)
+    def _write(self, step: tuple[int, int], parameters: _Parameters) -> None:
+        path = self._file(*step)
         partial = path.with_suffix(f".{os.getpid()}.partial")  # another process may write the same file
         with partial.open("wb") as file:
-            columns: dict[str, Any] = {name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES}
+            columns: dict[str, Any] = dict(parameters)
             np.savez(file, **columns)
         partial.replace(path)
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """What all draws of a dataset need: simulations by number, and the sound that geometry computes."""
+
+    dataset: Dataset
+    geometric: GeometricSound
+    simulations: dict[int, PairSimulation]
+    decay_db: float
+
+
+def _draw(drawing: _Drawing, step: tuple[int, int], _: IsOver) -> _Parameters:
+    """The parameters (listener, yaw) or (listener, yaw, ear) by name of a draw of an emitter."""
+    draw, emitter = step
+    number, take = divmod(draw, len(TAKES))
+    measured = []
+    for listener, _energy, late in drawing.simulations[number].take(
+        emitter, _listeners(drawing.dataset, emitter), take
+    ):
+        response = drawing.geometric.complete(emitter, listener, late)
+        measured.append(vars(measure(response, drawing.dataset.sample_rate, decay_db=drawing.decay_db)))
+    return {name: np.stack([of_pair[name] for of_pair in measured]) for name in _NAMES}
+
+
+def _listeners(dataset: Dataset, emitter: int) -> npt.NDArray[np.int64]:
+    """All held-out listeners of an emitter, even if only some are evaluated."""
+    return np.flatnonzero(dataset.held_out[emitter])
 
 
 def _median(values: _Floats) -> _Floats:

@@ -39,6 +39,8 @@ METRICS: tuple[Metric, ...] = (SPECTRAL_LOSS, *PARAMETER_METRICS, *PAPER_METRICS
 _STANDARD_ERRORS = 2.0
 # A method must not win because its hardest entries cannot be measured.
 _MISSING_ALLOWANCE = 0.01
+DECAY_DB = 30.0
+"""Decay times are measured over so much, unless a caller wants another range."""
 _TIMED_PAIRS = 7
 _TIMED_S = 5.0
 SPECTRAL_WINDOW_S = 0.0107
@@ -150,14 +152,14 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class _PairErrors:
+class PairErrors:
     """Measures the errors of all columns for one held-out pair at a time."""
 
     held_out: HeldOut
     columns: Sequence[Column]
     truth: Sequence[RoomParameters]
     decay_db: float
-    stored: StoredErrors | None
+    stored: StoredErrors | None = None
 
     @cached_property
     def _codec(self) -> Codec:
@@ -165,16 +167,20 @@ class _PairErrors:
 
     def of_pair(self, pair: int) -> Errors:
         """The errors by column; read from `stored` if they are there, otherwise measured and stored."""
-        if self.stored is not None and (found := self.stored.get(pair)) is not None:
+        found = {} if self.stored is None else self.stored.get(pair)
+        missing = [number for number in range(len(self.columns)) if number not in found]
+        if not missing:
             return found
         reference = np.asarray(self.held_out.reference(pair), dtype=np.float32)
         simulated = measure(reference, self.held_out.sample_rate, decay_db=self.decay_db)
         spectrogram = self._codec.log_magnitude(self._codec.transform(reference))
         paper = PaperErrors(reference, self.held_out.sample_rate)
-        errors = [self._of_column(column, pair, paper, simulated, spectrogram) for column in self.columns]
+        measured = {
+            number: self._of_column(self.columns[number], pair, paper, simulated, spectrogram) for number in missing
+        }
         if self.stored is not None:
-            self.stored.put(pair, errors)
-        return errors
+            self.stored.put(pair, measured)
+        return {**found, **measured}
 
     def _of_column(
         self,
@@ -218,7 +224,7 @@ def evaluate(
     of: int | None = None,
     truth: Sequence[RoomParameters] = (),
     draws: int = 1,
-    decay_db: float = 30.0,
+    decay_db: float = DECAY_DB,
     threads: int | None = None,
     stored: StoredErrors | None = None,
     timed: bool = True,
@@ -238,7 +244,7 @@ def evaluate(
     names = [column.name for column in columns]
     if len(set(names)) < len(names):
         raise EvaluationError(f"two columns have the same name among {', '.join(names)}")
-    measurement = _PairErrors(held_out, columns, truth, decay_db, stored)
+    measurement = PairErrors(held_out, columns, truth, decay_db, stored)
     pool = ThreadPoolExecutor(threads or os.cpu_count())
     try:
         pairs = range(len(held_out))

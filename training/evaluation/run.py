@@ -1,22 +1,25 @@
 """`nafir-train evaluate`: fields, baselines and the repeatability floor on one dataset."""
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from server.scene.bundle import Bundle
 from training.baselines.coded import Track
-from training.baselines.held_out import EvaluationError, HeldOut, open_held_out
+from training.baselines.held_out import EvaluationError, HeldOut
 from training.data.dataset import Half
 from training.evaluation.draws import median_parameters
+from training.evaluation.elsewhere import Comparison, measure_elsewhere
 from training.evaluation.evaluate import Column, Evaluation, Kind, evaluate
-from training.evaluation.fields import field_columns
 from training.evaluation.figure import draw_figure
-from training.evaluation.methods import DEFAULT_METHODS, floor_columns, method_columns, simulation_column
+from training.evaluation.methods import DEFAULT_METHODS, floor_columns, simulation_column
 from training.evaluation.published import PublishedTable, published_table
-from training.evaluation.stored_errors import StoredErrors, signature
-from training.simulation.responses import open_responses
+from training.evaluation.stored_errors import StoredErrors
+from training.parallel.jobs import ALL_CORES, Jobs
 
 
 def evaluate_bundles(
@@ -34,6 +37,7 @@ def evaluate_bundles(
     seed: int = 0,
     figure: Path | None = None,
     keep: Path | None = None,
+    jobs: Jobs = ALL_CORES,
     track: Track = lambda steps, _: steps,
 ) -> tuple[Evaluation, PublishedTable]:
     """Evaluate each quality level of each bundle, and the field of each run folder on measured data, beside `methods`
@@ -42,37 +46,26 @@ def evaluate_bundles(
     medians over `draws` simulations, or with those of the dataset's own simulation. With `hrtf` (a SOFA file) or
     `tilt_deg`, all are heard through that head, or with the head tilted by so many degrees. `figure` is the path of a
     PNG to draw. Errors are stored in the file `keep` pair by pair, so that an interrupted evaluation can be resumed;
-    the file is removed at the end.
+    the file is removed at the end. With `jobs` on other nodes, these measure errors, a column at a time, from the same
+    paths; times are measured here.
 
     Raises EvaluationError, DatasetError if the dataset and a bundle are of different scenes, and RunError for a run on
     other data.
     """
-    with open_held_out(data) as everything:
-        everything = everything if half is None else everything.of_half(half)
-        held_out = everything.sample(pairs=pairs, yaws=yaws, seed=seed)
-        if hrtf is not None or tilt_deg:
-            _require_waveforms(methods, draws)
-            held_out = held_out.reheard(hrtf, tilt_deg=tilt_deg)
-        truth = median_parameters(held_out, draws, track=track) if draws > 1 else []
-        columns = field_columns(bundles, held_out)
-        if runs:
-            # Torch takes seconds to load, and bundles do not need it.
-            from training.evaluation.measured_fields import run_columns
-
-            responses = open_responses(data)
-            columns += [column for run in runs for column in run_columns(run, responses, held_out)]
-        columns += method_columns(methods, held_out, track)
-        measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
-        stored = None
-        if keep is not None:
-            depends_on = [[bundle.digest for bundle in bundles], [signature(folder) for folder in (*runs, data)]]
-            head = None if hrtf is None else [str(hrtf), hrtf.stat().st_size, hrtf.stat().st_mtime_ns]
-            names = [column.name for column in measured]
-            stored = StoredErrors(keep, [depends_on, names, pairs, yaws, half, draws, seed, tilt_deg, head])
+    if hrtf is not None or tilt_deg:
+        _require_waveforms(methods, draws)
+    comparison = Comparison(tuple(bundles), data, tuple(runs), tuple(methods), pairs, yaws, half, hrtf, tilt_deg, seed)
+    of, held_out = comparison.open()
+    truth = median_parameters(held_out, draws, jobs=jobs, track=track) if draws > 1 else []
+    columns = comparison.columns(held_out, track)
+    measured = [*columns, *([simulation_column(held_out)] if truth else []), *floor_columns(held_out)]
+    with _stored(keep, comparison, [column.name for column in measured], draws) as stored:
+        if jobs.are_elsewhere:
+            measure_elsewhere(comparison, held_out, measured, truth, stored, jobs=jobs, track=track)
         evaluation = evaluate(
             held_out,
             measured,
-            of=len(everything),
+            of=of,
             truth=truth,
             draws=draws,
             stored=stored,
@@ -80,9 +73,20 @@ def evaluate_bundles(
         )
         if figure is not None:
             _draw(evaluation, figure, held_out, columns)
-        if stored is not None:
-            stored.discard()
-        return evaluation, published_table(simulated=held_out.simulated is not None)
+        stored.discard()
+    return evaluation, published_table(simulated=held_out.simulated is not None)
+
+
+@contextmanager
+def _stored(keep: Path | None, comparison: Comparison, names: list[str], draws: int) -> Iterator[StoredErrors]:
+    """The errors that are stored in a file, or in a temporary one."""
+    depends_on: list[Any] = [comparison.files(), names, comparison.pairs, comparison.yaws, comparison.half, draws]
+    depends_on += [comparison.seed, comparison.tilt_deg, str(comparison.hrtf)]
+    if keep is not None:
+        yield StoredErrors(keep, depends_on)
+        return
+    with tempfile.TemporaryDirectory(prefix="nafir-") as folder:
+        yield StoredErrors(Path(folder) / "errors", depends_on)
 
 
 def _require_waveforms(methods: Sequence[str], draws: int) -> None:

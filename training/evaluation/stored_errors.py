@@ -3,23 +3,24 @@
 import hashlib
 import json
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-import server
-import training
+from training.parallel.code_digest import code_digest
 
-Errors = Sequence[Mapping[str, npt.NDArray[np.float64]]]
-"""The errors of one pair: for each column, errors (yaw,) by metric."""
+ColumnErrors = Mapping[str, npt.NDArray[np.float64]]
+"""The errors of one pair in one column: (yaw,) by metric."""
+Errors = Mapping[int, ColumnErrors]
+"""The errors of one pair by the number of the column."""
 
 
 class StoredErrors:
-    """A file with a line of JSON per pair, after a first line with a digest of everything on which the errors depend.
-    Several threads may use it.
+    """A file with a line of JSON for each pair, or for some of its columns, after a first line with a digest of
+    everything on which the errors depend. Several threads may use it.
 
     A file with another digest, or from other code, is started again.
     """
@@ -28,24 +29,33 @@ class StoredErrors:
         """`depends_on` is everything besides the code on which the errors depend, in plain values for `json.dumps`."""
         self._path = path
         self._lock = threading.Lock()
-        key = hashlib.sha256(json.dumps([depends_on, _code()]).encode()).hexdigest()
+        key = hashlib.sha256(json.dumps([depends_on, code_digest()]).encode()).hexdigest()
         text = path.read_text() if path.exists() else ""
         # The last line may have been interrupted.
         lines = text[: text.rfind("\n") + 1].splitlines(keepends=True)
         if lines[:1] != [f"{key}\n"]:
             lines = [f"{key}\n"]
         path.write_text("".join(lines))
-        self._pairs = dict(map(_pair, lines[1:]))
+        self._pairs: dict[int, dict[int, ColumnErrors]] = {}
+        for line in lines[1:]:
+            pair, errors = _parsed(line)
+            self._pairs.setdefault(pair, {}).update(errors)
 
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def get(self, pair: int) -> Errors | None:
-        return self._pairs.get(pair)
+    def get(self, pair: int) -> Errors:
+        """The errors of those columns of a pair that were in the file when it was opened, or were put."""
+        with self._lock:
+            return dict(self._pairs.get(pair, {}))
 
     def put(self, pair: int, errors: Errors) -> None:
-        values = [{metric: of_yaws.tolist() for metric, of_yaws in column.items()} for column in errors]
+        values = {
+            number: {metric: of_yaws.tolist() for metric, of_yaws in column.items()}
+            for number, column in errors.items()
+        }
         with self._lock, self._path.open("a") as file:
+            self._pairs.setdefault(pair, {}).update(errors)
             file.write(json.dumps([pair, values]) + "\n")
 
     def discard(self) -> None:
@@ -59,14 +69,10 @@ def signature(folder: Path) -> list[tuple[str, int, int]]:
     return [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
 
 
-def _code() -> str:
-    digest = hashlib.sha256()
-    for package in (server, training):
-        for path in sorted(Path(package.__path__[0]).rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _pair(line: str) -> tuple[int, Errors]:
+def _parsed(line: str) -> tuple[int, dict[int, ColumnErrors]]:
+    """The pair of a line, and its errors by column."""
     pair, values = json.loads(line)
-    return pair, [{metric: np.array(of_yaws, np.float64) for metric, of_yaws in column.items()} for column in values]
+    return pair, {
+        int(number): {metric: np.array(of_yaws, np.float64) for metric, of_yaws in column.items()}
+        for number, column in values.items()
+    }

@@ -7,9 +7,8 @@ resumed. Times are measured at the end, for all levels in one run.
 import dataclasses
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -29,6 +28,7 @@ from training.frontier.bound import TruePhase
 from training.frontier.cost import SEGMENT_S, cost_of, measure, memory_mb, one_core
 from training.frontier.points import Point, default_among, eligible, offered_points, pareto
 from training.frontier.steps import largest_steps
+from training.parallel.jobs import ALL_CORES, IsOver, Job, Jobs
 
 _FORMAT = 5
 """Must change whenever the same graph comes to give other responses: older stored errors are then measured again."""
@@ -98,9 +98,17 @@ class Effort:
 
 
 def sweep(
-    bundle: Bundle, dataset: Dataset, levels: Sequence[QualityLevel], folder: Path, effort: Effort, progress: Progress
+    bundle: Bundle,
+    dataset: Dataset,
+    levels: Sequence[QualityLevel],
+    folder: Path,
+    effort: Effort,
+    progress: Progress,
+    *,
+    jobs: Jobs = ALL_CORES,
 ) -> Frontier:
     """Measures `levels` of the bundle on the dataset's held-out pairs. Results are stored in `folder` as they come.
+    Errors are measured in `jobs`, a level each; times are measured here, so that they are of one machine.
 
     Raises DatasetError if dataset and bundle are of different scenes.
     """
@@ -109,7 +117,7 @@ def sweep(
     trial = with_levels(bundle, levels, folder / "trial")
     samples = {half: _sample(dataset, trial, half, effort) for half in HALVES}
     floors = {half: sample.floor() for half, sample in samples.items()}
-    errors = _accuracies(trial, samples, levels, folder / "accuracy.json", effort, progress)
+    errors = _accuracies(trial, samples, levels, folder / "accuracy.json", effort, jobs, progress)
     task = progress.add_task("timing", total=math.ceil(effort.walk_s / SEGMENT_S))
     with one_core():
         times = measure(
@@ -210,6 +218,7 @@ def _accuracies(
     levels: Sequence[QualityLevel],
     path: Path,
     effort: Effort,
+    jobs: Jobs,
     progress: Progress,
 ) -> dict[str, dict[Half, Errors]]:
     """Errors by level and half. Those that `path` has for the same graph, noise and sample are not measured again."""
@@ -219,25 +228,34 @@ def _accuracies(
     missing = [name for name, key in keys.items() if key not in kept]
     progress.advance(task, len(levels) - len(missing))
 
-    def measured(name: str) -> dict[str, Any]:
-        field = AcousticField.load(trial, level=name)
-        found = {half: asdict(_errors(field, sample, effort.seed)) for half, sample in samples.items()}
-        steps = largest_steps(field, count=_STEPS, seed=effort.seed)
-        return {
-            half: {**of_half, "by_pair": of_half["by_pair"].tolist(), "steps": steps} for half, of_half in found.items()
-        }
-
-    pool = ThreadPoolExecutor(os.cpu_count(), "accuracy")
-    try:
-        for name, found in zip(missing, pool.map(measured, missing), strict=True):
+    wanted = [Job(f"scene {trial.id}, level {name}", name) for name in missing]
+    with closing(jobs.run(_measure_level, _Measurement(trial, samples, effort.seed), wanted)) as measured:
+        for name, found in measured:
             kept[keys[name]] = found
             path.write_text(json.dumps(kept))
             progress.update(task, advance=1, description=f"accuracy  {name}")
-    finally:
-        pool.shutdown(cancel_futures=True)
     return {
         name: {half: Errors(**{**kept[key][half], "by_pair": np.array(kept[key][half]["by_pair"])}) for half in HALVES}
         for name, key in keys.items()
+    }
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """What the measurement of every level needs."""
+
+    trial: Bundle
+    samples: Mapping[Half, SampledPairs]
+    seed: int
+
+
+def _measure_level(of: _Measurement, name: str, _: IsOver) -> dict[str, Any]:
+    """The errors of a level by half, in plain values for `json.dumps`."""
+    field = AcousticField.load(of.trial, level=name)
+    found = {half: asdict(_errors(field, sample, of.seed)) for half, sample in of.samples.items()}
+    steps = largest_steps(field, count=_STEPS, seed=of.seed)
+    return {
+        half: {**of_half, "by_pair": of_half["by_pair"].tolist(), "steps": steps} for half, of_half in found.items()
     }
 
 

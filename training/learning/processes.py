@@ -1,4 +1,4 @@
-"""Data-parallel training in as many processes as `torchrun` started, or in one.
+"""Data-parallel training in as many processes as `torchrun` or Ray Train started, or in one.
 
 Each process computes an equal share of every batch, and gradients are averaged. Only the first process reads and writes
 the run folder (all read the targets), and it makes the decisions that depend on time.
@@ -27,11 +27,15 @@ class Processes:
     @classmethod
     @contextmanager
     def joined(cls) -> Iterator["Processes"]:
-        """This process, as one of those that torchrun started, until the end of the block."""
+        """This process, as one of those that torchrun or Ray Train started, until the end of the block. Ray Train has
+        joined them already."""
         rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
         gpu = torch.cuda.is_available()
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if gpu else torch.device("cpu")
         if count == 1:
+            yield cls(rank, count, device)
+            return
+        if dist.is_initialized():
             yield cls(rank, count, device)
             return
         dist.init_process_group("nccl" if gpu else "gloo")

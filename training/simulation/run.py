@@ -1,11 +1,13 @@
 """The simulation of late reverberation between all pairs of probes of a scene. It can be resumed emitter by emitter,
-and gives the same result for the same seed.
+and gives the same result for the same seed, wherever its emitters are simulated.
 
-Emitters are simulated in threads; the compiled code releases the interpreter's lock.
+In one process that is in threads; the compiled code releases the interpreter's lock.
 """
 
-import threading
-from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from collections.abc import Iterable
+from concurrent.futures import CancelledError
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,12 @@ from rich.progress import Progress
 from training.data.dataset import Dataset
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulationPlan, overrides_among
+from training.parallel.jobs import IsOver, Job, Jobs
 from training.simulation.half_precision import to_half
 from training.simulation.pairs import PairSimulation
 from training.simulation.planner import planner_of
+
+_Takes = list[dict[int, npt.NDArray[np.float16]]]
 
 
 def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None) -> PairSimulation:
@@ -33,7 +38,7 @@ def simulate(
     folder: Path,
     *,
     seed: int,
-    workers: int,
+    jobs: Jobs,
     progress: Progress,
     simulation: PairSimulation | None = None,
 ) -> Dataset:
@@ -52,36 +57,36 @@ def simulate(
     simulation = simulation or prepared(scene, seed=seed, plan=plan)
     if simulation.tail is not None:
         dataset.write_tail(simulation.tail)
-    is_over = threading.Event()
-    with ThreadPoolExecutor(workers, "simulate") as pool:
-        running = {
-            pool.submit(_simulate_emitter, simulation, emitter, np.flatnonzero(dataset.held_out[emitter]), is_over)
-            for emitter in remaining
-        }
-        try:
-            for future in as_completed(running):
-                running.remove(future)
-                dataset.write(*future.result())
-                progress.advance(task)
-        except BaseException:
-            # After an interrupt or a full disk, do not wait for the emitters in progress.
-            is_over.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with closing(jobs.run(_simulate, simulation, list(_emitters(dataset, remaining)))) as simulated:
+        for emitter, takes in simulated:
+            dataset.write(emitter.number, takes)
+            progress.advance(task)
     return dataset
 
 
-def _simulate_emitter(
-    simulation: PairSimulation, emitter: int, repeated: npt.NDArray[np.int64], is_over: threading.Event
-) -> tuple[int, list[dict[int, npt.NDArray[np.float16]]]]:
-    """Return the emitter, and its log energies by take and listener; the second take has only the `repeated` listeners.
-    Raises CancelledError once `is_over` is set."""
-    listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter)
+@dataclass(frozen=True)
+class _Emitter:
+    """An emitter to simulate, and the listeners of its second take."""
+
+    number: int
+    repeated: npt.NDArray[np.int64]
+
+
+def _emitters(dataset: Dataset, remaining: Iterable[int]) -> Iterable[Job[_Emitter]]:
+    for number in remaining:
+        emitter = _Emitter(number, np.flatnonzero(dataset.held_out[number]))
+        yield Job(f"scene {dataset.scene.id}, emitter {number}", emitter)
+
+
+def _simulate(simulation: PairSimulation, emitter: _Emitter, is_over: IsOver) -> _Takes:
+    """The log energies of an emitter by take and listener; the second take has only the `repeated` listeners. Raises
+    CancelledError once it is over."""
+    listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter.number)
     takes = []
-    for number, wanted in enumerate((listeners, repeated)):
-        energies = simulation.energies(emitter, wanted, number)
-        if is_over.is_set():
+    for number, wanted in enumerate((listeners, emitter.repeated)):
+        energies = simulation.energies(emitter.number, wanted, number)
+        if is_over():
             raise CancelledError
         with np.errstate(divide="ignore"):  # the logarithm is -inf where no ray arrived
             takes.append(dict(zip(map(int, wanted), to_half(np.log(energies)), strict=True)))
-    return emitter, takes
+    return takes

@@ -11,7 +11,6 @@ On a GPU all points of the paper's recipe are affordable. Without one, give fewe
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +24,7 @@ from rich.progress import Progress
 from training.learning.record import TrainingRecord
 from training.learning.runs import CHECKPOINT, configure, load_checkpoint, record_of
 from training.learning.train import train
+from training.parallel.jobs import ALL_CORES
 from training.simulation.responses import open_responses
 from training.simulation.run import simulate
 
@@ -75,7 +75,7 @@ def train_some(
             return
         began_s = time.monotonic()
         data = runs / job.scene / "data"
-        simulate(SCENES / f"{job.scene}.toml", data, seed=0, workers=os.cpu_count() or 1, progress=progress)
+        simulate(SCENES / f"{job.scene}.toml", data, seed=0, jobs=ALL_CORES, progress=progress)
         configuration = configure(job.field, epochs=epochs, patience=patience, points=points)
         left_s = share_s - (time.monotonic() - began_s)
         yield job, train(open_responses(data), job.run(runs), configuration, progress, pause_after_s=left_s)

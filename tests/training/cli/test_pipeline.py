@@ -20,6 +20,7 @@ from server.responses.full_response import FullResponse
 from training.bundling.export import export
 from training.evaluation.run import evaluate_bundles
 from training.learning.train import train
+from training.parallel.jobs import LocalJobs
 from training.simulation.references import References
 from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
@@ -84,7 +85,7 @@ def test_a_field_of_a_room_without_reflections_is_silent(tiny_scene, configurati
     scene = tmp_path / "open_air.toml"
     scene.write_text(re.sub(r"absorption = .*", f"absorption = {[1.0] * 7}", tiny_scene.read_text()))
     progress = Progress(disable=True)
-    dataset = simulate(scene, tmp_path / "data", seed=0, workers=1, progress=progress)
+    dataset = simulate(scene, tmp_path / "data", seed=0, jobs=LocalJobs(1), progress=progress)
     responses = SimulatedResponses(dataset)
     train(responses, tmp_path / "run", dataclasses.replace(configuration, epochs=1), progress)
     field = AcousticField.load(export(responses, [tmp_path / "run"], tmp_path / "bundle"))

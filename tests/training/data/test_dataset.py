@@ -11,6 +11,7 @@ from training.data.dataset import TAKES, Dataset, DatasetError, own_duration_s
 from training.data.scene_file import HISTOGRAM_BIN_S
 from training.data.shared_tail import FADE_S, TRAINING, SharedTail
 from training.data.simulation_plan import SimulationPlan
+from training.parallel.jobs import LocalJobs
 from training.simulation.run import prepared, simulate
 
 EVERYTHING = SimulationPlan.everything(2, 500)
@@ -145,13 +146,13 @@ def test_takes_are_traced_independently_and_agree_on_the_level(dataset):
 def test_an_interrupted_simulation_goes_on_to_the_same_data(dataset, tiny_scene, tmp_path):
     folder, progress = tmp_path / "data", Impatient(2)
     with pytest.raises(KeyboardInterrupt):
-        simulate(tiny_scene, folder, seed=dataset.seed, workers=2, progress=progress)
+        simulate(tiny_scene, folder, seed=dataset.seed, jobs=LocalJobs(2), progress=progress)
     assert time.monotonic() - progress.lost_at < 15
-    assert not any(thread.name.startswith("simulate") for thread in threading.enumerate())
+    assert not any(thread.name.startswith("nafir-job") for thread in threading.enumerate())
     with pytest.raises(DatasetError, match="4 emitters are not simulated yet"):
         Dataset.open(folder)
 
-    resumed = simulate(tiny_scene, folder, seed=dataset.seed, workers=1, progress=Progress(disable=True))
+    resumed = simulate(tiny_scene, folder, seed=dataset.seed, jobs=LocalJobs(1), progress=Progress(disable=True))
     assert resumed.remaining() == []
     whole, pieced = stored(dataset.folder), stored(folder)
     assert whole.keys() == pieced.keys()

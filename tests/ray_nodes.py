@@ -1,0 +1,45 @@
+"""A Ray cluster on this machine, for the tests of `make cluster-test`. Its nodes have addresses of their own on the
+loopback interface. The test belongs to the first node, which is the head; the others may be killed."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+_STORE_BYTES = 150 * 1024 * 1024
+_PATIENT = {
+    "health_check_timeout_ms": 60_000,
+    "health_check_failure_threshold": 20,
+    "agent_register_timeout_ms": 300_000,
+    "worker_register_timeout_seconds": 300,
+    "gcs_rpc_server_reconnect_timeout_s": 300,
+}
+"""A node is not lost because the machine is busy; a killed one is noticed by its closed connection."""
+_SLOWNESS = 20.0
+"""Ray gives a node 30 s to start, which is not enough on a busy machine: its clock runs so much slower meanwhile."""
+
+
+@contextmanager
+def ray_nodes(*cores: int) -> Iterator[Any]:
+    """A `ray.cluster_utils.Cluster` of nodes with so many cores each."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    from ray._private import node
+    from ray.cluster_utils import Cluster
+
+    slow = SimpleNamespace(**{**vars(time), "monotonic": lambda: time.monotonic() / _SLOWNESS})
+    options = {"object_store_memory": _STORE_BYTES, "include_dashboard": False}
+    cluster = Cluster(shutdown_at_exit=False)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(node, "time", slow)
+            for number, count in enumerate(cores, start=2):
+                only_first = {"_system_config": _PATIENT} if number == 2 else {}
+                cluster.add_node(num_cpus=count, node_ip_address=f"127.0.0.{number}", **options, **only_first)
+        yield cluster
+    finally:
+        for each in [*cluster.worker_nodes, *([cluster.head_node] if cluster.head_node else [])]:
+            cluster.remove_node(each, allow_graceful=False)
