@@ -6,9 +6,11 @@ messages without extensions over the loopback interface.
 
 import asyncio
 import base64
+import contextlib
 import itertools
 import json
 import math
+import re
 import struct
 import time
 from collections.abc import Sequence
@@ -95,6 +97,10 @@ class Walker(asyncio.Protocol):
         self._pose_ids = itertools.count(1)
         self._is_closing = False
         self.is_lost = False
+        self.retry_after_s: int | None = None
+        """After how many seconds the server told it to come back; None if it was not refused in this way."""
+        self.answered_s: float | None = None
+        """When the server let it in or refused it, by `time.monotonic`."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -112,7 +118,7 @@ class Walker(asyncio.Protocol):
             if not end:
                 return
             if b" 101 " not in head.partition(b"\r\n")[0]:
-                self._fail(head.decode(errors="replace"))
+                self._refuse(head.decode(errors="replace"))
                 return
             self._reply = None
             self._begin()
@@ -150,7 +156,7 @@ class Walker(asyncio.Protocol):
             self._transport.abort()
 
     def _begin(self) -> None:
-        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=SCENE).serialize().encode())
+        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=SCENE, emitters=len(self._places)).serialize().encode())
         for number, place in enumerate(self._places):
             self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=place).serialize().encode())
         if self._poses_per_s > 0:
@@ -162,8 +168,12 @@ class Walker(asyncio.Protocol):
             self._silent -= 1
             if self._silent == 0 and not self.sounds.done():
                 self.sounds.set_result(None)
+        elif message["type"] == "welcome":
+            self.answered_s = time.monotonic()
         elif message["type"] == "error":
             self.errors.append(message["code"])
+            if self.answered_s is None:
+                self.answered_s, self.retry_after_s = time.monotonic(), message.get("retry_after_s")
 
     def _receive_audio(self, payload: bytes) -> None:
         if payload[0] != AudioBlock.KIND:
@@ -190,6 +200,13 @@ class Walker(asyncio.Protocol):
     def _send(self, opcode: int, payload: bytes) -> None:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.write(frame(opcode, payload))
+
+    def _refuse(self, head: str) -> None:
+        """Note an answer in place of the upgrade."""
+        self.answered_s = time.monotonic()
+        told = re.search(r"^retry-after: *(\d+)", head, re.IGNORECASE | re.MULTILINE)
+        self.retry_after_s = None if told is None else int(told[1])
+        self._fail(head)
 
     def _fail(self, reason: str) -> None:
         self.errors.append(reason)
@@ -227,6 +244,23 @@ class Crowd:
             _, walker = await loop.create_connection(make, "127.0.0.1", self._port)
             self.walkers.append(walker)
             await asyncio.wait_for(walker.sounds, _PATIENCE_S)
+
+    async def rush(self, count: int) -> list[Walker]:
+        """Have `count` walkers ask at once, and keep those that hear all their emitters. Returns all of them once each
+        hears or was refused, or after some seconds."""
+        loop = asyncio.get_running_loop()
+
+        async def ask(number: int) -> Walker:
+            places = [tuple(place) for place in self._rng.uniform(*_PLACES, (self._emitters, 3)).tolist()]
+            make = partial(Walker, places, phase=number * _GOLDEN % 1, poses_per_s=self._poses_per_s)
+            _, walker = await loop.create_connection(make, "127.0.0.1", self._port)
+            with contextlib.suppress(ConnectionError, TimeoutError):
+                await asyncio.wait_for(asyncio.shield(walker.sounds), _PATIENCE_S)
+            return walker
+
+        walkers = await asyncio.gather(*(ask(number) for number in range(count)))
+        self.walkers += [walker for walker in walkers if walker.hears_all]
+        return walkers
 
     async def close(self) -> None:
         await self.resize(0)

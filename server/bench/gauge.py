@@ -7,12 +7,14 @@ server has finished its one-time work after the start.
 """
 
 import json
+import os
 import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -89,7 +91,7 @@ class Gauge:
         match scope["type"], scope.get("path"):
             case "http", "/bench/begin":
                 self._begin(scope["state"]["host"])
-                await _answer({}, send)
+                await _answer({"resident_mb": resident_mb()}, send)
             case "http", "/bench/settled":
                 host = scope["state"]["host"]
                 await _answer({"is_settled": host.effect_costs.keys() >= host.scenes.keys()}, send)
@@ -169,6 +171,7 @@ class Gauge:
             "ir_ms": merged(counts.stream.times.response for counts in self._counts),
             "pose_to_audio_ms": merged(watch.direct.times for watch in self._watches),
             "pose_to_reverberation_ms": merged(watch.reverberation.times for watch in self._watches),
+            "resident_mb": resident_mb(),
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,
             "server_load_by_thread": self._loads_by_thread(duration_s),
         }
@@ -180,6 +183,12 @@ class Gauge:
             for thread, began_s in self._began_thread_cpu_s.items()
             if thread.is_alive()
         }
+
+
+def resident_mb() -> float | None:
+    """Memory of this process in megabytes; None where the system does not say."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statm.exists() else None
 
 
 def _thread_cpu_s(thread: threading.Thread) -> float:

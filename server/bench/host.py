@@ -1,4 +1,5 @@
 """A server of the benchmark's scene in a process of its own, confined to one core: `python -m server.bench.host CORE`.
+With `admission` as a second argument it refuses what would break somebody's sound; without, a search can find the limit.
 
 It prints its port in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import uvicorn
 
+ADMISSION = "admission"
 _MAX_STREAMS = 1_000
 _CLIP_S = 10
 
@@ -42,7 +44,7 @@ def serve() -> None:
     with tempfile.TemporaryDirectory() as folder, socket.socket() as listener:
         clip = Path(folder) / f"{CLIP}.wav"
         soundfile.write(clip, 0.05 * noise(0, _CLIP_S * SAMPLE_RATE), SAMPLE_RATE, subtype="FLOAT")
-        settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS)
+        settings = Settings(port=0, clips=(clip,), max_streams=_MAX_STREAMS, admission=sys.argv[2:] == [ADMISSION])
         app = Gauge(create_app(settings, scenes={SCENE: FieldsByLevel([BankField()])}))
         server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
         listener.bind((settings.host, 0))

@@ -39,13 +39,14 @@ from typing import IO, Any
 
 from server.bench.crowd import Crowd
 from server.bench.gauge import merged
+from server.bench.host import ADMISSION
 from server.bench.machine import describe_machine
 from server.bench.report import Goal, Judgement
 from server.bench.scene import IR_S, SAMPLE_RATE
 from server.core.errors import NafirError
 
 _BLOCK_SIZE = 256
-_LATE_SHARE = 0.001
+LATE_SHARE = 0.001
 _HOPELESS = 0.5
 _ON_THEIR_WAY = 64
 """Blocks of a session that may be sent but not received yet when a run ends."""
@@ -81,20 +82,13 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
     """Measure one case for each number of emitters. If interrupted after the first case, it returns the cases so far
     with `is_complete` false. Raises NafirError if a process cannot be confined to a core or the server does not
     start."""
-    if not hasattr(os, "sched_setaffinity"):
-        raise NafirError("this system cannot confine a process to one core")
-    usable = os.sched_getaffinity(0)
-    core = max(usable)
-    os.sched_setaffinity(0, usable - {core} or usable)
     cases: list[dict[str, Any]] = []
-    try:
-        with _serve(core) as port:
+    with one_core() as core, serve(core) as port:
+        try:
             asyncio.run(_measure(plan, port, advance, cases))
-    except KeyboardInterrupt:
-        if not cases:
-            raise
-    finally:
-        os.sched_setaffinity(0, usable)
+        except KeyboardInterrupt:
+            if not cases:
+                raise
     measured: dict[str, Any] = {
         "host": describe_machine(),
         "block_size": _BLOCK_SIZE,
@@ -102,12 +96,31 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
         "ir_s": IR_S,
         "poses_per_s": plan.poses_per_s,
         "duration_s": plan.duration_s,
-        "clients_have_other_cores": len(usable) > 1,
+        "clients_have_other_cores": len(usable_cores()) > 1,
         "is_complete": len(cases) == len(plan.emitters),
         "cases": cases,
     }
     measured["summary"] = [asdict(judgement) for judgement in judge(cases)]
     return measured
+
+
+def usable_cores() -> set[int]:
+    """Numbers of the cores that this process may use. Raises NafirError if the system cannot confine a process."""
+    if not hasattr(os, "sched_setaffinity"):
+        raise NafirError("this system cannot confine a process to one core")
+    return os.sched_getaffinity(0)
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[int]:
+    """Keep this process from the last core that it may use, where it has others; yields the number of that core."""
+    usable = usable_cores()
+    core = max(usable)
+    os.sched_setaffinity(0, usable - {core} or usable)
+    try:
+        yield core
+    finally:
+        os.sched_setaffinity(0, usable)
 
 
 def judge(cases: list[dict[str, Any]]) -> list[Judgement]:
@@ -142,10 +155,10 @@ def failure(run: dict[str, Any]) -> str | None:
         return f"only {run['streams']} of {run['sessions']} sessions had a stream"
     if run["blocks_sent"] == 0:
         return f"{run['sessions']} sessions were sent no block"
-    if run["late_share"] >= _LATE_SHARE:
+    if run["late_share"] >= LATE_SHARE:
         missing = f", {run['blocks_missing']} never made" if run["blocks_missing"] else ""
         late = f"of {run['sessions']} sessions {run['late_share']:.2%} of blocks were late{missing}"
-        return f"{late}; under {_LATE_SHARE:.1%} may be"
+        return f"{late}; under {LATE_SHARE:.1%} may be"
     if run["blocks_heard"] < run["blocks_sent"] - _ON_THEIR_WAY * run["sessions"]:
         return f"{run['sessions']} sessions heard {run['blocks_heard']} of {run['blocks_sent']} blocks"
     if run["poses_per_s"] > 0 and run["pose_to_audio_ms"]["p99"] is None:
@@ -234,7 +247,7 @@ class _Trial:
         for walker in walkers:
             walker.begin()
         started_s, started_cpu_s = time.perf_counter(), time.process_time()
-        too_many = _LATE_SHARE * sessions * duration_s * SAMPLE_RATE / _BLOCK_SIZE if until_failed else math.inf
+        too_many = LATE_SHARE * sessions * duration_s * SAMPLE_RATE / _BLOCK_SIZE if until_failed else math.inf
         await self._wait(duration_s, too_many)
         client_load = (time.process_time() - started_cpu_s) / (time.perf_counter() - started_s)
         measured = await self._ask("report")
@@ -242,7 +255,7 @@ class _Trial:
         return {
             "sessions": sessions,
             "poses_per_s": self._poses_per_s,
-            "late_share": min(1.0, _count_late(measured) / due) if due else 1.0,
+            "late_share": min(1.0, count_late(measured) / due) if due else 1.0,
             **measured,
             "client_pose_to_audio_ms": merged(walker.poses.times for walker in walkers),
             "blocks_heard": sum(walker.blocks for walker in walkers),
@@ -255,21 +268,22 @@ class _Trial:
         until_s = time.monotonic() + duration_s
         while (left_s := until_s - time.monotonic()) > 0:
             await asyncio.sleep(min(left_s, _LOOK_EVERY_S) if too_many < math.inf else left_s)
-            if too_many < math.inf and _count_late(await self._ask("blocks")) >= too_many:
+            if too_many < math.inf and count_late(await self._ask("blocks")) >= too_many:
                 return
 
     async def _ask(self, what: str) -> dict[str, Any]:
         return await asyncio.to_thread(_get, f"{self._url}/{what}")
 
 
-def _count_late(measured: dict[str, Any]) -> int:
+def count_late(measured: dict[str, Any]) -> int:
     return sum(measured[name] for name in ("blocks_late", "blocks_dropped", "blocks_missing"))
 
 
 @contextlib.contextmanager
-def _serve(core: int) -> Iterator[int]:
-    """Run a server on one core. Yields its port once it is ready and has measured the costs of effects."""
-    command = [sys.executable, "-m", "server.bench.host", str(core)]
+def serve(core: int, *, admits: bool = False) -> Iterator[int]:
+    """Run a server on one core, which refuses streams without room if it `admits` others. Yields its port once it is
+    ready and has measured the costs of effects."""
+    command = [sys.executable, "-m", "server.bench.host", str(core), *([ADMISSION] if admits else [])]
     # In a process group of its own, so that Ctrl-C does not reach it. It ends with this process.
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
@@ -310,6 +324,11 @@ def _is_ready(port: int) -> bool:
     except OSError:
         return False
     return True
+
+
+def ask(port: int, what: str) -> dict[str, Any]:
+    """The answer of a bench's server to `/bench/{what}`."""
+    return _get(f"http://127.0.0.1:{port}/bench/{what}")
 
 
 def _get(url: str) -> dict[str, Any]:
