@@ -75,7 +75,7 @@ def _host(core: int) -> None:
         patch.object(gauge.Gauge, "_begin", begin_anew),
         patch.object(gauge.Gauge, "_report", with_compiled),
     ):
-        host.serve(scene.SCENE, is_metered=False)
+        host.serve(scene.SCENE)
 
 
 @contextlib.contextmanager

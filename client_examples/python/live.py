@@ -18,7 +18,7 @@ import numpy as np
 import soundfile
 import soxr
 from websockets.asyncio.client import connect
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import InvalidStatus, WebSocketException
 
 DRY = struct.Struct("<BBHII")  # kind 3, encoding 0 (f32), bytes of the id, sequence, frames; then id and frames
 WET = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
@@ -144,6 +144,11 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         asyncio.run(perform(arguments))
+    except InvalidStatus as exc:
+        if exc.response.status_code != 503:
+            raise SystemExit(f"{arguments.url}: {exc}") from exc
+        # The server has no room for another stream, and says when it is worth to come back.
+        raise SystemExit(f"{arguments.url}: {json.loads(exc.response.body or b'{}').get('detail', exc)}") from exc
     except (OSError, WebSocketException) as exc:
         raise SystemExit(f"{arguments.url}: {exc}") from exc
 

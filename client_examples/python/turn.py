@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 from websockets.asyncio.client import connect
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import InvalidStatus, WebSocketException
 
 BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
 PROTOCOL = 2
@@ -179,6 +179,11 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         asyncio.run(listen(arguments))
+    except InvalidStatus as exc:
+        if exc.response.status_code != 503:
+            raise SystemExit(f"{arguments.url}: {exc}") from exc
+        # The server has no room for another stream, and says when it is worth to come back.
+        raise SystemExit(f"{arguments.url}: {json.loads(exc.response.body or b'{}').get('detail', exc)}") from exc
     except (OSError, WebSocketException) as exc:
         raise SystemExit(f"{arguments.url}: {exc}") from exc
 

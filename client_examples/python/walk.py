@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 POSE = struct.Struct("<BBHI7f")  # kind 2, two paddings, pose id, position, orientation
 BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
@@ -278,6 +278,11 @@ def main() -> None:
     arguments.path = arguments.path or arguments.output.with_name("path.csv")
     try:
         asyncio.run(listen(arguments))
+    except InvalidStatus as exc:
+        if exc.response.status_code != 503:
+            raise SystemExit(f"{arguments.url}: {exc}") from exc
+        # The server has no room for another stream, and says when it is worth to come back.
+        raise SystemExit(f"{arguments.url}: {json.loads(exc.response.body or b'{}').get('detail', exc)}") from exc
     except (OSError, WebSocketException) as exc:
         raise SystemExit(f"{arguments.url}: {exc}") from exc
 

@@ -39,6 +39,7 @@ from server.responses.ir_request import compute_irs
 from server.runtime.drain import Drain
 from server.runtime.memory import collect_as_usual, collect_rarely
 from server.runtime.own_thread import run_in_own_thread
+from server.runtime.pace import CpuBudget
 from server.runtime.priority import DutyCycle, become_background, become_prompt
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
@@ -90,6 +91,8 @@ def create_app(
                 workers=settings.ir_workers + 1,
                 waiting=settings.max_waiting_requests,
                 is_urgent=lambda: workers.are_busy,
+                budget=CpuBudget(lambda: host.admission.background_share),
+                on_refusal=lambda: host.admission.count_request(),  # noqa: PLW0108  the host is made later
             ) as responses,
             CompilingProcess() if compiler is None else compiler as compiling,
         ):

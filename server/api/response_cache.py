@@ -20,7 +20,7 @@ from typing import Literal, Self, get_args
 
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import RequestError
-from server.runtime.pace import Checkpoint, Pace
+from server.runtime.pace import Checkpoint, CpuBudget, Pace
 from server.runtime.priority import become_background
 from server.runtime.thread_pool import ThreadPool
 
@@ -56,12 +56,21 @@ class _Computation:
 
 class ResponseCache:
     """Computes bodies on `workers` threads; at most `waiting` computations wait for a thread. Computations pause while
-    `is_urgent`, which any thread may call, says that streams need the processor.
+    `is_urgent`, which any thread may call, says that streams need the processor, and wait until their `budget` of CPU
+    time allows them. `on_refusal` is called whenever there is no room for one.
 
     Leaving the context cancels all computations.
     """
 
-    def __init__(self, *, workers: int, waiting: int, is_urgent: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        *,
+        workers: int,
+        waiting: int,
+        is_urgent: Callable[[], bool] = lambda: False,
+        budget: CpuBudget | None = None,
+        on_refusal: Callable[[], None] = lambda: None,
+    ) -> None:
         self.pool = ThreadPool(
             workers, "nafir-http", initializer=partial(become_background, _NICENESS), patience_s=_PATIENCE_S
         )
@@ -69,6 +78,8 @@ class ResponseCache:
         self._most_running = workers
         self._most_maps = max(1, workers - 1)
         self._is_urgent = is_urgent
+        self._budget = budget
+        self._on_refusal = on_refusal
         self._bodies: BoundedCache[str, bytes] = BoundedCache(_MAX_BYTES)
         self._by_tag: dict[str, _Computation] = {}
         self._waiting: deque[_Computation] = deque()
@@ -140,6 +151,7 @@ class ResponseCache:
         return True
 
     def _busy(self) -> RequestError:
+        self._on_refusal()
         return RequestError(
             "server_busy",
             "too many requests wait for an answer: ask again later",
@@ -187,9 +199,10 @@ class ResponseCache:
     def _run(self, computation: _Computation, loop: asyncio.AbstractEventLoop) -> None:
         """Compute the body, on a thread of the pool."""
         began_s = time.monotonic()
-        pace = Pace(is_urgent=self._is_urgent, is_wanted=lambda: not computation.is_called_off)
+        pace = Pace(is_urgent=self._is_urgent, is_wanted=lambda: not computation.is_called_off, budget=self._budget)
         body, failure = b"", None
         try:
+            pace.wait()
             pace()
             body = computation.compute(pace)
         except (Exception, CancelledError) as exc:  # noqa: BLE001  raised where the body is awaited

@@ -240,6 +240,33 @@ def costs(
 
 
 @app.command()
+def overload(
+    scene: Annotated[
+        str, typer.Option(help="A bundled scene's id, the folder of any scene bundle, or `bench`.")
+    ] = "apartment",
+    emitters: Annotated[int, typer.Option(min=1, max=16, help="Of each session.")] = 16,
+    sessions: Annotated[
+        int | None, typer.Option(min=1, help="How many sessions a core serves. [default: finds out, some five minutes]")
+    ] = None,
+    duration_s: Annotated[float, typer.Option(min=1, help="How long those let in are listened to.")] = 60.0,
+    as_json: AsJson = False,
+) -> Outcome:
+    """What becomes of three times as many sessions as one core serves, when all ask at once.
+
+    Those let in may have no late blocks and no lower quality, and all others have to be told within a second when to
+    come back.
+    """
+    from server.bench.overload import failures, measure_overload
+
+    measured = measure_overload(
+        scene, emitters=emitters, sessions=sessions, duration_s=duration_s, advance=_steps_told()
+    )
+    _report(as_json, f"Three times {measured['capacity']} sessions of {emitters} emitters at once", measured)
+    figures = {name: measured[name] for name in ("admitted", "late_share", "steps_down", "answer_s", "memory_growth")}
+    return Outcome("overload", figures, tuple(failures(measured)))
+
+
+@app.command()
 def effects(
     as_json: AsJson = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a table for a README.")] = False,

@@ -7,9 +7,11 @@ messages without extensions over the loopback interface.
 
 import asyncio
 import base64
+import contextlib
 import itertools
 import json
 import math
+import re
 import struct
 import time
 from collections.abc import Sequence
@@ -99,6 +101,10 @@ class Walker(asyncio.Protocol):
         self._pose_ids, self._steps = itertools.count(1), itertools.count(1)
         self._is_closing = False
         self.is_lost = False
+        self.retry_after_s: int | None = None
+        """After how many seconds the server told it to come back; None if it was not refused in this way."""
+        self.answered_s: float | None = None
+        """When the server let it in or refused it, by `time.monotonic`."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -116,7 +122,7 @@ class Walker(asyncio.Protocol):
             if not end:
                 return
             if b" 101 " not in head.partition(b"\r\n")[0]:
-                self._fail(head.decode(errors="replace"))
+                self._refuse(head.decode(errors="replace"))
                 return
             self._reply = None
             self._begin()
@@ -155,7 +161,10 @@ class Walker(asyncio.Protocol):
             self._transport.abort()
 
     def _begin(self) -> None:
-        self._send(_TEXT, Hello(protocol=PROTOCOL, scene=self._places.bundle.id).serialize().encode())
+        self._send(
+            _TEXT,
+            Hello(protocol=PROTOCOL, scene=self._places.bundle.id, emitters=len(self._emitters)).serialize().encode(),
+        )
         for number, circle in enumerate(self._emitters):
             position = circle.at(0.0) if self._sways else circle.centre
             self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=position).serialize().encode())
@@ -168,8 +177,12 @@ class Walker(asyncio.Protocol):
             self._silent -= 1
             if self._silent == 0 and not self.sounds.done():
                 self.sounds.set_result(None)
+        elif message["type"] == "welcome":
+            self.answered_s = time.monotonic()
         elif message["type"] == "error":
             self.errors.append(message["code"])
+            if self.answered_s is None:
+                self.answered_s, self.retry_after_s = time.monotonic(), message.get("retry_after_s")
 
     def _receive_audio(self, payload: bytes) -> None:
         if payload[0] != AudioBlock.KIND:
@@ -203,6 +216,13 @@ class Walker(asyncio.Protocol):
     def _send(self, opcode: int, payload: bytes) -> None:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.write(frame(opcode, payload))
+
+    def _refuse(self, head: str) -> None:
+        """Note an answer in place of the upgrade."""
+        self.answered_s = time.monotonic()
+        told = re.search(r"^retry-after: *(\d+)", head, re.IGNORECASE | re.MULTILINE)
+        self.retry_after_s = None if told is None else int(told[1])
+        self._fail(head)
 
     def _fail(self, reason: str) -> None:
         self.errors.append(reason)
@@ -243,15 +263,31 @@ class Crowd:
             if walker not in kept:
                 walker.close()
         self.walkers = kept
-        loop = asyncio.get_running_loop()
         for number in range(len(self.walkers), count):
-            emitters = self._places.emitters(self.emitters, self._rng)
-            phase = number * _GOLDEN % 1
-            pace = {"phase": phase, "poses_per_s": self.poses_per_s}
-            make = partial(Walker, self._places, emitters, **pace, sways=self._sways)
-            _, walker = await loop.create_connection(make, "127.0.0.1", self._port)
+            walker = await self._connect(number)
             self.walkers.append(walker)
             await asyncio.wait_for(walker.sounds, _PATIENCE_S)
+
+    async def rush(self, count: int) -> list[Walker]:
+        """Have `count` walkers ask at once, and keep those that hear all their emitters. Returns all of them once each
+        hears or was refused, or after some seconds."""
+
+        async def ask(number: int) -> Walker:
+            walker = await self._connect(number)
+            with contextlib.suppress(ConnectionError, TimeoutError):
+                await asyncio.wait_for(asyncio.shield(walker.sounds), _PATIENCE_S)
+            return walker
+
+        walkers = await asyncio.gather(*(ask(number) for number in range(count)))
+        self.walkers += [walker for walker in walkers if walker.hears_all]
+        return walkers
+
+    async def _connect(self, number: int) -> Walker:
+        emitters = self._places.emitters(self.emitters, self._rng)
+        pace = {"phase": number * _GOLDEN % 1, "poses_per_s": self.poses_per_s}
+        make = partial(Walker, self._places, emitters, **pace, sways=self._sways)
+        _, walker = await asyncio.get_running_loop().create_connection(make, "127.0.0.1", self._port)
+        return walker
 
     async def close(self) -> None:
         await self.resize(0)

@@ -142,7 +142,7 @@ class Gauge:
         match scope["type"], scope.get("path"):
             case "http", "/bench/begin":
                 self._begin(scope["state"]["host"])
-                await _answer({}, send)
+                await _answer({"resident_bytes": resident_bytes()}, send)
             case "http", "/bench/settled":
                 host = scope["state"]["host"]
                 await _answer({"is_settled": host.effect_costs.keys() >= host.scenes.keys()}, send)

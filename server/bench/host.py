@@ -1,7 +1,8 @@
 """A server of one scene in a process of its own, confined to one core:
-`python -m server.bench.host CORE SCENE [--meter]`.
+`python -m server.bench.host CORE SCENE [--meter] [--admission]`.
 
-With `--meter` it measures what each part of its work costs (`server.bench.meter`). It prints its port and the memory
+With `--admission` it refuses what would break somebody's sound; without, a search can find the limit. With `--meter` it
+measures what each part of its work costs (`server.bench.meter`). It prints its port and the memory
 that the scene took in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """
 
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import uvicorn
 
+METER, ADMISSION = "--meter", "--admission"
 _MAX_STREAMS = 1_000
 """Streams, and connections of one address, that the benchmark may open: no limit of the server is to end a search."""
 _CLIP_S = 10
@@ -24,12 +26,11 @@ _CLIP_S = 10
 def main() -> None:
     core, scene, *options = sys.argv[1:]
     os.sched_setaffinity(0, {int(core)})
-    serve(
-        scene, is_metered="--meter" in options
-    )  # imported modules start threads and count cores, so they are imported only now
+    # Imported modules start threads and count cores, so they are imported only now.
+    serve(scene, is_metered=METER in options, admits=ADMISSION in options)
 
 
-def serve(scene: str, *, is_metered: bool) -> None:
+def serve(scene: str, *, is_metered: bool = False, admits: bool = False) -> None:
     import socket
 
     import soundfile
@@ -60,7 +61,7 @@ def serve(scene: str, *, is_metered: bool) -> None:
             clips=(clip,),
             max_streams=_MAX_STREAMS,
             max_connections_per_address=_MAX_STREAMS,
-            admission=False,  # a search has to find what breaks
+            admission=admits,
         )
         allow_connections(settings.max_connections)
         app = Gauge(create_app(settings, scenes={levels.bundle.id: levels}), meter=meter)

@@ -53,13 +53,14 @@ from typing import IO, Any, NamedTuple
 
 from server.bench.crowd import BLOCK_SIZE, Crowd
 from server.bench.gauge import latencies
+from server.bench.host import ADMISSION, METER
 from server.bench.machine import describe_machine, has_wide_vectors
 from server.bench.places import Places
 from server.bench.report import Goal, Judgement
 from server.bench.scene import SCENE, bundle_of
 from server.core.errors import NafirError
 
-_LATE_SHARE = 0.001
+LATE_SHARE = 0.001
 _HOPELESS = 0.5
 _ON_THEIR_WAY = 64
 """Blocks of a session that may be sent but not received yet when a run ends."""
@@ -253,10 +254,10 @@ def failure(run: dict[str, Any]) -> str | None:
         return f"only {run['streams']} of {run['sessions']} sessions had a stream"
     if run["blocks_sent"] == 0:
         return f"{run['sessions']} sessions were sent no block"
-    if run["late_share"] >= _LATE_SHARE:
+    if run["late_share"] >= LATE_SHARE:
         missing = f", {run['blocks_missing']} never made" if run["blocks_missing"] else ""
         late = f"of {run['sessions']} sessions {run['late_share']:.2%} of blocks were late{missing}"
-        return f"{late}; under {_LATE_SHARE:.1%} may be"
+        return f"{late}; under {LATE_SHARE:.1%} may be"
     if run["blocks_heard"] < run["blocks_sent"] - _ON_THEIR_WAY * run["sessions"]:
         return f"{run['sessions']} sessions heard {run['blocks_heard']} of {run['blocks_sent']} blocks"
     if run["poses_per_s"] > 0:
@@ -353,7 +354,7 @@ class Trial:
         for walker in walkers:
             walker.begin()
         started_s, started_cpu_s = time.perf_counter(), time.process_time()
-        too_many = _LATE_SHARE * sessions * duration_s * self.crowd.blocks_per_s if until_failed else math.inf
+        too_many = LATE_SHARE * sessions * duration_s * self.crowd.blocks_per_s if until_failed else math.inf
         await self._wait(duration_s, too_many)
         client_load = (time.process_time() - started_cpu_s) / (time.perf_counter() - started_s)
         measured = await self._ask("report")
@@ -362,7 +363,7 @@ class Trial:
         return {
             "sessions": sessions,
             "poses_per_s": self.crowd.poses_per_s,
-            "late_share": min(1.0, _count_late(measured) / due) if due else 1.0,
+            "late_share": min(1.0, count_late(measured) / due) if due else 1.0,
             **measured,
             "client_pose_to_audio_ms": latencies([walker.poses for walker in walkers], now_s),
             "client_pose_to_reverberation_ms": latencies([walker.reverberation for walker in walkers], now_s),
@@ -376,14 +377,14 @@ class Trial:
         until_s = time.monotonic() + duration_s
         while (left_s := until_s - time.monotonic()) > 0:
             await asyncio.sleep(min(left_s, _LOOK_EVERY_S) if too_many < math.inf else left_s)
-            if too_many < math.inf and _count_late(await self._ask("blocks")) >= too_many:
+            if too_many < math.inf and count_late(await self._ask("blocks")) >= too_many:
                 return
 
     async def _ask(self, what: str) -> dict[str, Any]:
         return await asyncio.to_thread(_get, f"{self._url}/{what}")
 
 
-def _count_late(measured: dict[str, Any]) -> int:
+def count_late(measured: dict[str, Any]) -> int:
     return sum(measured[name] for name in ("blocks_late", "blocks_dropped", "blocks_missing"))
 
 
@@ -395,10 +396,12 @@ class Served(NamedTuple):
 
 
 @contextlib.contextmanager
-def served(core: int, scene: str, *, is_metered: bool = False) -> Iterator[Served]:
+def served(core: int, scene: str, *, is_metered: bool = False, admits: bool = False) -> Iterator[Served]:
     """Run a server of a scene on one core. Yields where it is once it is ready and has measured the costs of effects.
-    With `is_metered` its reports say what each part of its work costs."""
-    command = [sys.executable, "-m", "server.bench.host", str(core), scene, *(["--meter"] if is_metered else [])]
+    With `is_metered` its reports say what each part of its work costs; if it `admits` others, it refuses those without
+    room."""
+    options = [name for name, is_wanted in ((METER, is_metered), (ADMISSION, admits)) if is_wanted]
+    command = [sys.executable, "-m", "server.bench.host", str(core), scene, *options]
     # In a process group of its own, so that Ctrl-C does not reach it. It ends with this process.
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
@@ -439,6 +442,11 @@ def _is_ready(port: int) -> bool:
     except OSError:
         return False
     return True
+
+
+def ask(port: int, what: str) -> dict[str, Any]:
+    """The answer of a bench's server to `/bench/{what}`."""
+    return _get(f"http://127.0.0.1:{port}/bench/{what}")
 
 
 def _get(url: str) -> dict[str, Any]:

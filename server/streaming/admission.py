@@ -30,6 +30,7 @@ from server.streaming.headroom import (
     ThreadLoad,
     blocks_needed,
     expected_cost,
+    fits_on_top,
     freest_thread,
     headroom,
     obstacle,
@@ -55,6 +56,8 @@ _WHY: Final[dict[Scarce, str]] = {
     "responses": "the server has no time left for more impulse responses",
     "opening": "too many streams begin just now",
 }
+_REQUEST: Final = "request", "computations"
+"""How HTTP requests are counted for whose computation there is no room."""
 _SHOWN_EMITTERS = 16
 """Streams that came last, by which it is judged how many emitters the next will have."""
 
@@ -122,14 +125,16 @@ class Admission:
         loop_cpu_s: Callable[[], float] = time.thread_time,
         luck: Callable[[], float] = random.random,
     ) -> None:
-        self.refusals: Counter[tuple[Asked, Scarce]] = Counter(
-            {(asked, scarce): 0 for asked in get_args(Asked) for scarce in get_args(Scarce)}
+        self.refusals: Counter[tuple[str, str]] = Counter(
+            {(asked, scarce): 0 for asked in get_args(Asked) for scarce in get_args(Scarce)} | {_REQUEST: 0}
         )
         """How often what was refused, and for lack of what."""
         self.headroom = 1.0
         """The share of the server that is free, from 0 to 1, at the last measurement."""
         self.spare_cores = float(cores)
         """Cores that streams left free at the last measurement."""
+        self.background_share = math.inf
+        """Share of a core that HTTP computations may take: half of what streams leave, and all of it without any."""
         self._engine = engine
         self._most_streams, self._cores, self._is_on = most_streams, cores, is_on
         self._limits, self._thresholds = limits, thresholds
@@ -175,7 +180,13 @@ class Admission:
         load = self.load()
         self.headroom = headroom(self._limits, self._thresholds, load)
         self.spare_cores = spare_cores(self._limits, self._thresholds, load)
+        left = self.spare_cores - load.demand - load.eased_demand
+        self.background_share = max(self._limits.least_background, left / 2) if load.streams else math.inf
         self._announce(load)
+        eased = max((stream.request_s for stream in self._engine.streams if stream.ladder.is_eased), default=0.0)
+        has_room = not self._is_on or load.streams <= 1 or fits_on_top(self._limits, self._thresholds, load, eased)
+        for thread in self._engine.threads:
+            thread.has_room_on_top = has_room
 
     def load(self) -> ServerLoad:
         """Return what all streams take, those with a place but not opened yet included."""
@@ -203,6 +214,10 @@ class Admission:
     def offer(self, kind: StreamKind, step: QualityStep) -> None:
         """Note the cheapest step of a kind of streams, by which clients are turned away."""
         self._cheapest[kind.key] = kind, step
+
+    def count_request(self) -> None:
+        """Count an HTTP request that was refused because too many computations wait."""
+        self.refusals[_REQUEST] += 1
 
     def turn_away(self) -> Refusal | None:
         """Return a refusal if not even the cheapest stream fits."""
@@ -361,7 +376,7 @@ class Admission:
             self._refused_until_s.popleft()
         next_s = seconds_to_next_ending(limits, self._endings_s, now_s, streams=len(self._places))
         if scarce == "opening":
-            next_s = 0.0
+            next_s = self._limits.most_opening_s
         seconds = retry_after_s(limits, next_ending_s=next_s, waiting=len(self._refused_until_s), luck=self._luck())
         if asked in {"upgrade", "hello"}:
             self._refused_until_s.append(now_s + seconds)

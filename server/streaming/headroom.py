@@ -48,7 +48,7 @@ class Limits:
     full_workers: float = 0.5
     """Share of the time left for IRs that streams on top of their ladders may ask for together for waits to be short.
     Beyond it, each waits for one request of all others in turn."""
-    most_opening_s: float = 0.1
+    most_opening_s: float = 0.05
     """Seconds for which the first IRs of newcomers may keep the workers. They go before all others, and two periods of
     the load policy with long waits are one too many."""
 
@@ -72,6 +72,8 @@ class Limits:
     correction_weight: float = 0.05
     """Weight of a quarter of a second in that factor."""
 
+    least_background: float = 0.05
+    """Share of a core that HTTP computations get however busy streams are: somebody who asks is answered some time."""
     least_retry_s: float = 2.0
     """Shortest time after which a refused client is asked to come back, but for newcomers that came all at once."""
     most_retry_s: float = 60.0
@@ -307,6 +309,19 @@ def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: in
     if not is_lasting:
         return "responses"
     return "opening" if load.opening_s > limits.most_opening_s * spare else None
+
+
+def fits_on_top(limits: Limits, thresholds: Thresholds, load: ServerLoad, request_s: float) -> bool:
+    """Return whether one more stream, with such requests for IRs, may step up to the top of its ladder without those
+    who are there having to step down."""
+    spare = min(float(load.workers), spare_cores(limits, thresholds, load), _spare_when_full(limits, thresholds, load))
+    risen = replace(
+        load,
+        round_s=load.round_s + request_s,
+        demand=load.demand + request_s * limits.poses_hz,
+        patience_s=min(load.patience_s, thresholds.patience_s),
+    )
+    return _waits_are_short(limits, thresholds, risen, spare)
 
 
 def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> float:

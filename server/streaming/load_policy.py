@@ -50,12 +50,14 @@ class LoadSample:
 @dataclass(frozen=True)
 class Measurement(Generic[Key]):
     """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it.
-    `least_blocks` is the least number of blocks at once, for newcomers whose work is still to come."""
+    `least_blocks` is the least number of blocks at once, for newcomers whose work is still to come. Unless it
+    `has_room_on_top`, no stream steps up to the top of its ladder, from where it asks for IRs as often as it likes."""
 
     now_s: float
     busy: float
     streams: Mapping[Key, LoadSample]
     least_blocks: int = 1
+    has_room_on_top: bool = True
 
     @property
     def lateness(self) -> float:
@@ -318,7 +320,11 @@ def _move(
         for key in _best_off(ladders):
             lower(key)
         return replace(thread, moved_s=now_s), ladders, moved
-    rising = [key for key in ladders if _may_rise(thresholds, thread, ladders[key], now_s)]
+    rising = [
+        key
+        for key, ladder in ladders.items()
+        if _may_rise(thresholds, thread, ladder, now_s) and (measurement.has_room_on_top or ladder.at > 1)
+    ]
     if rising and not moved:
         key = max(rising, key=lambda key: ladders[key].at)
         ladders[key] = _raised(ladders[key], now_s)

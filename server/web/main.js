@@ -387,7 +387,7 @@ class Page {
 
   #streamState(detail) {
     if (!this.playing) return;
-    const { state, attempt, retryMs, reason } = detail;
+    const { state, attempt, retryMs, reason, isBusy } = detail;
     if (state === "connecting" && attempt === 0) {
       this.#setConnection("connecting", "Connecting");
       this.#blank();
@@ -403,9 +403,12 @@ class Page {
       this.notices.clear("connection");
     } else if (state === "waiting") {
       this.steady = false;
-      this.#setConnection("waiting", "Reconnecting");
+      this.#setConnection("waiting", isBusy ? "Waiting for room" : "Reconnecting");
       this.#blank();
-      if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
+      if (isBusy) {
+        const seconds = Math.round(retryMs / 1000);
+        this.notices.show("connection", `The server has no room for another listener. Trying again in ${seconds} s.`, { lasting: true });
+      } else if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
     } else if (state === "refused") {
       this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);

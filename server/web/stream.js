@@ -9,6 +9,7 @@ const RETRY_MS = [250, 500, 1000, 2000, 4000];
 const REST_MS = 1000; // the pose of a listener at rest is sent again this often, so that the measured latency stays current
 const SILENCE_MS = 4000; // a server that sends audio is never silent for this long
 const REFUSED = 1008; // the hello was refused, so a new connection would not help
+const BUSY = 503;
 
 export const now = () => performance.timeOrigin + performance.now();
 
@@ -24,6 +25,9 @@ export class Stream {
   #heardAt = 0;
   #poseId = 0;
   #lastError = null;
+  #comeBackMs = null; // after which a server without room said to come back
+  #missing = new Set(); // ids of emitters that were asked for and are not heard yet
+  #asking = 0; // timer that asks for them again
   #listener; // {position, yaw, at}
   #emitters = new Map(); // id -> {clip, position, gainDb, at}
   #dirty = new Set(); // "listener" and emitter ids that moved since they were last sent
@@ -33,7 +37,7 @@ export class Stream {
 
   /**
    * `hello` is {scene, sampleRate, level, effects, output, order, head}; `listeners` are callbacks: block(block), state({state, ...}),
-   * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field}).
+   * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}).
    */
   constructor({ url, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -57,7 +61,7 @@ export class Stream {
     if (!this.#welcomed) return;
     if (!known || known.clip !== clip) {
       if (known) this.#send(message.removeEmitter(id));
-      this.#send(message.addEmitter(emitter));
+      this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
       this.#send(message.setGain(emitter));
     } else {
@@ -69,6 +73,7 @@ export class Stream {
   removeEmitter(id) {
     if (!this.#emitters.delete(id)) return;
     this.#dirty.delete(`emitter ${id}`);
+    this.#missing.delete(id);
     if (this.#welcomed) this.#send(message.removeEmitter(id));
   }
 
@@ -101,7 +106,18 @@ export class Stream {
     this.#listeners.state({ state: "closed" });
   }
 
+  #add(emitter) {
+    this.#missing.add(emitter.id);
+    this.#send(message.addEmitter(emitter));
+  }
+
+  #askAgain() {
+    for (const id of this.#missing) this.#send(message.addEmitter(this.#emitters.get(id)));
+  }
+
   #detach() {
+    clearTimeout(this.#asking);
+    this.#missing.clear();
     clearInterval(this.#watchdog);
     clearInterval(this.#heartbeat);
     const socket = this.#socket;
@@ -118,12 +134,14 @@ export class Stream {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       const { position, yaw, at } = this.#listener;
-      socket.send(message.hello({ ...this.#hello, listener: { position, yaw } }));
+      socket.send(message.hello({ ...this.#hello, listener: { position, yaw }, emitters: this.#emitters.size }));
       this.#poseId = 0; // the hello's listener is pose 0
       this.#listeners.posed({ poseId: 0, at: Math.max(at, now()) });
     };
     socket.onmessage = ({ data }) => (typeof data === "string" ? this.#receive(JSON.parse(data)) : this.#receiveBlock(data));
-    socket.onclose = ({ code, reason }) => this.#lost(code, reason);
+    let isOpen = false;
+    socket.addEventListener("open", () => (isOpen = true));
+    socket.onclose = ({ code, reason }) => (isOpen ? this.#lost(code, reason) : this.#unopened(socket, code, reason));
     this.#socket = socket;
     this.#heardAt = now();
     this.#watchdog = setInterval(() => {
@@ -132,15 +150,25 @@ export class Stream {
     }, 1000);
   }
 
+  // A browser does not tell why a WebSocket was refused. Asked by HTTP, a server without room says when to come back.
+  async #unopened(socket, code, reason) {
+    const answer = await fetch(this.#url.replace(/^ws/, "http"), { cache: "no-store" }).catch(() => null);
+    if (this.#socket !== socket) return; // closed or renewed meanwhile
+    if (answer?.status === BUSY) this.#comeBackMs = 1000 * Number(answer.headers.get("Retry-After")) || null;
+    this.#lost(code, reason);
+  }
+
   #lost(code, reason) {
     this.#detach();
     if (code === REFUSED) {
       this.#listeners.state({ state: "refused", reason: this.#lastError ?? (reason || "The server refused the stream.") });
       return;
     }
-    const wait = RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];
+    const wait = this.#comeBackMs ?? RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];
+    const isBusy = this.#comeBackMs !== null;
+    this.#comeBackMs = null;
     this.#attempt += 1;
-    this.#listeners.state({ state: "waiting", code, reason, retryMs: wait });
+    this.#listeners.state({ state: "waiting", code, reason, retryMs: wait, isBusy });
     this.#retry = setTimeout(() => this.#connect(), wait);
   }
 
@@ -150,8 +178,17 @@ export class Stream {
     else if (received.type === "status") this.#listeners.status(received);
     else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "plan_changed") this.#listeners.effects(received);
+    else if (received.type === "emitter_added") this.#missing.delete(received.id);
     else if (received.type === "error") {
       this.#lastError = received.message;
+      const comeBackMs = received.retry_after_s ? 1000 * received.retry_after_s : null;
+      if (!this.#welcomed) {
+        this.#comeBackMs = comeBackMs;
+        if (comeBackMs !== null) return; // the state says so
+      } else if (comeBackMs !== null) {
+        clearTimeout(this.#asking);
+        this.#asking = setTimeout(() => this.#askAgain(), comeBackMs);
+      }
       this.#listeners.refused(received);
     }
   }
@@ -162,7 +199,7 @@ export class Stream {
     this.#lastError = null;
     this.#dirty.clear();
     this.#listeners.state({ state: "live", welcome });
-    for (const emitter of this.#emitters.values()) this.#send(message.addEmitter(emitter));
+    for (const emitter of this.#emitters.values()) this.#add(emitter);
     // Everything that moved between hello and welcome is in here.
     this.setListener({ ...this.#listener, at: now() });
     clearInterval(this.#heartbeat);

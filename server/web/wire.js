@@ -57,9 +57,9 @@ export function parseBlock(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, level, effects, output, order, head, listener }) =>
+  hello: ({ scene, sampleRate, level, effects, output, order, head, listener, emitters }) =>
     JSON.stringify({
-      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, order, hrtf: head, listener,
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, order, hrtf: head, listener, emitters,
     }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),

@@ -1,0 +1,117 @@
+"""What happens when three times as many listeners ask at once as one core serves.
+
+The number that a core serves is given, or found as in `server.bench.sessions`. Then a server that refuses what would
+break somebody's sound is asked for three times as many streams in the same moment, with all their emitters.
+
+- `admitted`: streams that were let in and hear all their emitters. Of their blocks fewer than one in a thousand may be
+  late, and none may step down to a cheaper quality.
+- `refused`: everybody else has to be told within a second when to come back. `answer_s` is the longest time from the
+  connection until a client was let in or refused.
+- `memory_growth`: memory of the server at the end, as a share of what it took when all had been answered, less one.
+"""
+
+import asyncio
+import time
+import urllib.request
+from collections.abc import Callable
+from typing import Any
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from server.bench.crowd import Crowd
+from server.bench.machine import describe_machine
+from server.bench.places import Places
+from server.bench.scene import bundle_of
+from server.bench.sessions import LATE_SHARE, Plan, ask, count_late, measure_sessions, own_core, served
+
+TIMES = 3
+_ANSWER_S = 1.0
+_MOST_GROWTH = 0.05
+_SETTLE_S = 2.0
+
+
+def measure_overload(
+    scene: str,
+    *,
+    emitters: int,
+    sessions: int | None,
+    duration_s: float,
+    advance: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure with so many `emitters` a stream; without `sessions`, first find how many a core serves. Raises
+    NafirError if a process cannot be confined to a core or the server does not start."""
+    if sessions is None:
+        found = measure_sessions(Plan(scenes=(scene,), emitters=(emitters,), duration_s=duration_s), advance)
+        sessions = int(found["cases"][0]["sessions"]) if found["cases"] else 0
+    places = Places.of(bundle_of(scene))
+    with own_core() as (core, _), served(core, scene, admits=True) as server:
+        crowd = Crowd(server.port, places, emitters=emitters, poses_per_s=Plan.poses_per_s)
+        measured = asyncio.run(_overload(server.port, crowd, TIMES * max(1, sessions), duration_s))
+    return {"host": describe_machine(), "scene": scene, "emitters": emitters, "capacity": sessions, **measured}
+
+
+async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> dict[str, Any]:
+    try:
+        began_s = time.monotonic()
+        walkers = await crowd.rush(asked)
+        waits_s = [(walker.answered_s or time.monotonic()) - began_s for walker in walkers]
+        refused = [walker for walker in walkers if walker.retry_after_s is not None and not walker.hears_all]
+        await asyncio.sleep(_SETTLE_S)
+        before = await asyncio.to_thread(ask, port, "begin")
+        await asyncio.sleep(duration_s)
+        report = await asyncio.to_thread(ask, port, "report")
+        steps = await asyncio.to_thread(_steps_down, port)
+        due = sum(report[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
+        return {
+            "asked": asked,
+            "admitted": len(crowd.walkers),
+            "refused": len(refused),
+            "unanswered": asked - len(crowd.walkers) - len(refused),
+            "answer_s": max(waits_s),
+            "least_retry_s": min((walker.retry_after_s or 0 for walker in refused), default=None),
+            "most_retry_s": max((walker.retry_after_s or 0 for walker in refused), default=None),
+            "late_share": min(1.0, count_late(report) / due) if due else 1.0,
+            "steps_down": steps,
+            "streams": report["streams"],
+            "pose_to_audio_ms": report["pose_to_audio_ms"],
+            "pose_to_reverberation_ms": report["pose_to_reverberation_ms"],
+            "server_load": report["server_load"],
+            "resident_bytes": report["resident_bytes"],
+            "memory_growth": None
+            if before["resident_bytes"] is None
+            else report["resident_bytes"] / before["resident_bytes"] - 1,
+        }
+    finally:
+        await crowd.close()
+
+
+def failures(measured: dict[str, Any]) -> list[str]:
+    """What did not hold, a line each."""
+    found = []
+    if not measured["admitted"]:
+        found.append("nobody was let in")
+    if measured["unanswered"]:
+        found.append(f"{measured['unanswered']} were neither let in whole nor told when to come back")
+    if measured["answer_s"] > _ANSWER_S:
+        found.append(f"the last of {measured['asked']} was answered after {measured['answer_s']:.1f} s")
+    if measured["late_share"] >= LATE_SHARE:
+        found.append(f"{measured['late_share']:.2%} of blocks were late; under {LATE_SHARE:.1%} may be")
+    if measured["steps_down"]:
+        found.append(f"streams stepped down {measured['steps_down']} times")
+    if measured["streams"] < measured["admitted"]:
+        found.append(f"{measured['admitted'] - measured['streams']} streams that were let in have ended")
+    if (measured["memory_growth"] or 0.0) > _MOST_GROWTH:
+        found.append(f"memory grew by {measured['memory_growth']:.1%}")
+    return found
+
+
+def _steps_down(port: int) -> int:
+    """How often streams have stepped down because of load."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as answer:
+        families = text_string_to_metric_families(answer.read().decode())
+    samples = (sample for family in families for sample in family.samples)
+    return sum(
+        int(sample.value)
+        for sample in samples
+        if sample.name == "nafir_level_steps_total" and sample.labels["reason"] == "load"
+    )

@@ -1,0 +1,100 @@
+"""Laws of admission on simulated cores: three times as many ask at once as a server can bear."""
+
+from functools import cache
+
+import pytest
+
+from server.streaming.headroom import LIMITS
+from tests.streaming.simulated_server import SimulatedServer
+
+END_S = 30.0
+CORES = {
+    "two cores": (1.0, 1.0),
+    "two slow cores": (0.5, 0.5),
+    "all on one fast core": (2.0,),
+    "all on one slow core": (0.5,),
+}
+each = pytest.mark.parametrize("name", CORES)
+
+
+@cache
+def overloaded(name, announces=True):
+    """Sixty clients with 32 emitters each come within 1.2 s, three times as many as any of the servers bears."""
+    server = SimulatedServer(speeds=CORES[name], admits=True)
+    server.arrive(60, at_s=1.0, every_s=0.02, announces=announces)
+    return server.run(END_S)
+
+
+def admitted(server):
+    return [client for client in server.clients if client.stream is not None]
+
+
+def late_share(clients):
+    return sum(len(client.late_s) for client in clients) / sum(len(client.sent_s) for client in clients)
+
+
+def most_steps_down(clients):
+    """By how many steps a stream ever stood below the one on which it was let in."""
+    return max(at - client.began_at for client in clients for _, at in [(0.0, client.began_at), *client.moves])
+
+
+@each
+def test_blocks_of_those_let_in_are_in_time(name):
+    assert late_share(admitted(overloaded(name))) < 0.001
+
+
+@each
+def test_nobody_who_was_let_in_steps_down(name):
+    assert most_steps_down(admitted(overloaded(name))) <= 0
+
+
+@each
+def test_most_are_refused_and_told_when_to_come_back(name):
+    server = overloaded(name)
+    refused = [client.refused for client in server.clients if client.refused is not None]
+    assert len(refused) + len(admitted(server)) == 60
+    assert 3 * len(admitted(server)) <= 60 + 2 * len(refused)
+    assert all(1 <= refusal.retry_after_s <= LIMITS.most_retry_s for refusal in refused)
+    assert len({refusal.retry_after_s for refusal in refused}) > 2
+
+
+def test_without_admission_the_same_clients_break_the_sound():
+    server = SimulatedServer(speeds=CORES["two slow cores"])
+    server.arrive(60, at_s=1.0, every_s=0.02)
+    server.run(10.0)
+    assert late_share(admitted(server)) > 0.1
+
+
+def test_there_is_room_again_when_streams_have_ended():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    server.arrive(20, at_s=1.0, every_s=0.02, until_s=10.0)
+    later = server.arrive(3, at_s=20.0, every_s=1.0)
+    server.run(30.0)
+    assert all(client.stream is not None for client in later)
+    assert late_share(admitted(server)) < 0.001
+
+
+def test_a_trickle_is_let_in_until_it_would_cost_somebody_a_step():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    server.arrive(16, at_s=1.0, every_s=3.0)
+    server.run(60.0)
+    assert len(admitted(server)) >= 4
+    assert most_steps_down(admitted(server)) <= 0
+    assert late_share(admitted(server)) < 0.001
+
+
+def test_emitters_that_nobody_announced_are_expected_as_others_have_them():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    server.arrive(1, at_s=1.0)
+    server.run(3.0)
+    assert server.admission._usual_emitters == 32
+
+
+def test_headroom_falls_as_streams_come_and_rises_as_they_go():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    assert server.admission.headroom == 1.0
+    server.arrive(4, at_s=1.0, every_s=0.5, until_s=12.0)
+    server.run(10.0)
+    assert 0.0 < server.admission.headroom < 0.8
+    server.run(16.0)
+    assert server.admission.headroom == 1.0
