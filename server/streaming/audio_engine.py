@@ -167,7 +167,7 @@ class AudioEngine:
     def open(self, stream: Stream) -> None:
         """Start a stream now, on the least busy thread. If all of them are dead or stuck, on the least busy of all."""
         loads = self._loads()
-        able = [thread for thread in self.threads if thread.busy is not None] or self.threads
+        able = [thread for thread in self.threads if thread.busy_share is not None] or self.threads
         thread = min(able, key=lambda thread: sum(loads[thread].values()))
         self._thread_of[stream] = thread
         self._share_workers()
@@ -208,7 +208,7 @@ class AudioEngine:
         """Number of streams of each thread, by name, and the share of the last period in which it rendered. Any thread
         may call this."""
         counts = Counter(tuple(self._thread_of.values()))
-        return {thread.name: (counts[thread], thread.busy or 0.0) for thread in tuple(self.threads)}
+        return {thread.name: (counts[thread], thread.busy_share or 0.0) for thread in tuple(self.threads)}
 
     def _loads(self) -> dict["AudioThread", dict[Stream, float]]:
         """Return the share of a core of each stream, by thread. A stream that has just opened has shown little of what
@@ -229,7 +229,10 @@ class AudioEngine:
             return
         self._balanced_s = now_s
         loads = self._loads()
-        measured = [None if thread.busy is None else ThreadLoad(thread.busy, loads[thread]) for thread in self.threads]
+        measured = [
+            None if thread.busy_share is None else ThreadLoad(thread.busy_share, loads[thread])
+            for thread in self.threads
+        ]
         self._balance_state, move = balance(self._thresholds, self._balance_state, now_s, measured)
         if move is not None:
             source = self.threads[move.source]
@@ -315,7 +318,7 @@ class AudioThread:
         return self._load.ahead.blocks
 
     @property
-    def busy(self) -> float | None:
+    def busy_share(self) -> float | None:
         """The share of the last period in which it rendered; None if it is dead or stuck. Any thread may call this."""
         if self.is_dead:
             return None

@@ -408,7 +408,7 @@ def test_no_stream_opens_on_a_thread_that_is_stuck(pair):
     pair.engine.threads[0]._is_ticking = True
     pair.clock.now_s += 3.0
     pair.engine.threads[1].tick()
-    assert pair.engine.threads[0].busy is None
+    assert pair.engine.threads[0].busy_share is None
     assert [pair.number_of(pair.open()[0]) for _ in range(3)] == [1, 1, 1]
 
 
