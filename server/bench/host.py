@@ -1,5 +1,5 @@
 """A server of the benchmark's scene in a process of its own, confined to one core: `python -m server.bench.host CORE`.
-With `admission` as a second argument it refuses what would break somebody's sound; without, a search can find the limit.
+With `admission` as a second argument it refuses what would break somebody's sound; without, a search finds the limit.
 
 It prints its port in one line of JSON, and ends when its standard input is closed. `server.bench.sessions` starts it.
 """

@@ -130,7 +130,7 @@ def test_the_bench_ends_with_code_1_where_its_run_failed(monkeypatch, run, code,
     async def measure(_plan, _port, _advance, cases):
         cases.append({"emitters": emitters, "is_given": True, **run, "trials": []})
 
-    monkeypatch.setattr(bench, "_serve", serve)
+    monkeypatch.setattr(bench, "serve", serve)
     monkeypatch.setattr(bench, "_measure", measure)
     outcome = CliRunner().invoke(app, ["stream", "--emitters", str(emitters), "--sessions", "20", *form])
     assert outcome.exit_code == code, outcome.output
@@ -213,7 +213,7 @@ def test_what_is_interrupted_keeps_what_it_has(monkeypatch, done):
         cases += [case_of(1, 3)] * done
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench, "_serve", serve)
+    monkeypatch.setattr(bench, "serve", serve)
     monkeypatch.setattr(bench, "_measure", measure)
     if not done:
         with pytest.raises(KeyboardInterrupt):
