@@ -53,6 +53,7 @@ async def _overload(port: int, emitters: int, asked: int, duration_s: float) -> 
         await asyncio.sleep(duration_s)
         report = await asyncio.to_thread(ask, port, "report")
         steps = await asyncio.to_thread(_steps_down, port)
+        memory_mb = before["resident_mb"]
         due = sum(report[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
         return {
             "asked": asked,
@@ -69,9 +70,7 @@ async def _overload(port: int, emitters: int, asked: int, duration_s: float) -> 
             "pose_to_reverberation_ms": report["pose_to_reverberation_ms"],
             "server_load": report["server_load"],
             "resident_mb": report["resident_mb"],
-            "memory_growth": None
-            if before["resident_mb"] is None
-            else report["resident_mb"] / before["resident_mb"] - 1,
+            "memory_growth": None if memory_mb is None else report["resident_mb"] / memory_mb - 1,
         }
     finally:
         await crowd.close()
