@@ -61,6 +61,7 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
         await asyncio.sleep(duration_s)
         report = await asyncio.to_thread(ask, port, "report")
         steps = await asyncio.to_thread(_steps_down, port)
+        memory_bytes = before["resident_bytes"]
         due = sum(report[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
         return {
             "asked": asked,
@@ -77,9 +78,7 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
             "pose_to_reverberation_ms": report["pose_to_reverberation_ms"],
             "server_load": report["server_load"],
             "resident_bytes": report["resident_bytes"],
-            "memory_growth": None
-            if before["resident_bytes"] is None
-            else report["resident_bytes"] / before["resident_bytes"] - 1,
+            "memory_growth": None if memory_bytes is None else report["resident_bytes"] / memory_bytes - 1,
         }
     finally:
         await crowd.close()

@@ -494,7 +494,7 @@ class SimulatedServer:
         each_s, exchange_s = self._costs.block_s / 16 / speed, self._costs.exchange_s / 16 / speed
         render = {}
         for name, level in self._levels.items():
-            share = self._costs.shared_tail if level.level.shared_tail else 1.0
+            share = self._costs.shared[kind_of(level.level).sharing]
             render[name] = RenderCost(self._costs.tick_s / speed, share * each_s, exchange_s)
         walk = {name: level.walk_ms / level.miss_ms for name, level in self._levels.items()}
         return StreamKind(("simulated", 1_024, None), BLOCK_S, render, walk)
