@@ -21,6 +21,7 @@ EMITTERS: Final = 1, 16
 CROWDS: Final = 100, 1_000, 1_000_000
 MACHINE: Final = Machine(cores=16, memory_bytes=64 * 2**30, network_bits_per_s=10e9, open_files=1_048_576)
 """The machine that crowds are planned for."""
+_LATE_SHARE: Final = 0.01
 _SPARE: Final = "the rest of the thread: waking, sleeping, the interpreter"
 
 
@@ -69,8 +70,11 @@ def _parts(measured: Measured) -> dict[str, Any]:
 
 
 def _extremes(measured: Measured, emitters: int) -> list[Run]:
-    of_emitters = sorted((run for run in measured.runs if run.emitters == emitters), key=lambda run: run.sessions)
-    return [of_emitters[0], of_emitters[-1]] if len(of_emitters) > 1 else of_emitters
+    """The runs with the fewest and with the most sessions. A run whose blocks were late did not do all of its work, so
+    it counts only where all were."""
+    runs = sorted((run for run in measured.runs if run.emitters == emitters), key=lambda run: run.sessions)
+    in_time = [run for run in runs if run.late_share < _LATE_SHARE] or runs
+    return [in_time[0], in_time[-1]] if len(in_time) > 1 else in_time
 
 
 def _capacity(measured: list[Measured]) -> dict[str, Any]:

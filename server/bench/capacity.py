@@ -420,7 +420,7 @@ def limits(
         Limit(
             "interpreter's lock",
             of_time(lambda each: each.in_python, usable),
-            "Python code of all threads takes turns on one core",
+            "what all threads do in Python takes turns on one core; with system calls counted in, so it may bear more",
         ),
         Limit(
             "network",

@@ -35,6 +35,16 @@ def test_every_part_has_a_row_and_the_last_is_their_sum(tmp_path, monkeypatch):
     json.loads((tmp_path / "result.json").read_text())
 
 
+def test_a_run_that_was_late_is_no_column_unless_all_were():
+    *others, last = MEASURED.runs
+    late = MEASURED.model_copy(update={"runs": (*others, last.model_copy(update={"late_share": 0.3}))})
+    titles = [column.title for column in listener_second.result_of([late]).tables["flat"].columns[2:]]
+    assert titles == ["2 × 1", "9 × 1", "2 × 16", "5 × 16"]
+    all_late = tuple(run.model_copy(update={"late_share": 0.3}) for run in MEASURED.runs)
+    table = listener_second.result_of([MEASURED.model_copy(update={"runs": all_late})]).tables["flat"]
+    assert [column.title for column in table.columns[2:]] == ["2 × 1", "9 × 1", "2 × 16", "9 × 16"]
+
+
 @pytest.mark.parametrize(
     ("other", "field"),
     [
