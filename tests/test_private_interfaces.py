@@ -106,7 +106,10 @@ def test_every_private_interface_in_use_has_a_contract_here() -> None:
         for file, module in imports()
         if private.match(module) and not any(module == known or module.startswith(f"{known}.") for known in MODULES)
     }
-    allowed = {("server/kernels/compiled.py", "numba.np.arraymath")}  # imported for what it imports, not used
+    allowed = {
+        ("server/kernels/compiled.py", "numba.np.arraymath"),  # imported for what it imports, not used
+        ("server/cluster/deployment.py", "ray._private.worker"),  # tried with Ray itself in tests of the cluster
+    }
     assert unknown - allowed == set(), "describe in this file what is relied on of it, and pin its package"
 
 
