@@ -39,11 +39,14 @@ def client(bundle, hrtfs):
 
 @pytest.mark.parametrize(("path", "params"), [*GETS, ("/v1/scenes/moon", {}), (f"{SCENE}/loudness", {}), ("/no", {})])
 def test_head_is_get_without_a_body(client, path, params):
-    got, head = client.get(path, params=params), client.head(path, params=params)
+    for _ in range(3):  # a plan changes once more when the server has measured what effects cost
+        got, head = client.get(path, params=params), client.head(path, params=params)
+        told = [{name: text for name, text in each.headers.items() if name not in CHANGING} for each in (got, head)]
+        if told[0] == told[1]:
+            break
+    assert told[0] == told[1]
     assert head.status_code == got.status_code
     assert head.content == b""
-    told = [{name: text for name, text in each.headers.items() if name not in CHANGING} for each in (got, head)]
-    assert told[0] == told[1]
     assert int(head.headers["content-length"]) == len(got.content) > 0
 
 
