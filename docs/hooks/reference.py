@@ -10,7 +10,7 @@ from typing import Any, Final
 from reference_commands import commands_of
 from reference_errors import error_definitions
 from reference_goals import bench_goals
-from reference_load import load_thresholds
+from reference_load import admission_limits, load_thresholds
 from reference_packages import package_matrix, packages
 from reference_schemas import manifest, settings
 from reference_services import http, metrics, problem_codes, stream, stream_codes
@@ -28,6 +28,7 @@ GENERATORS: Final[Mapping[str, Callable[[], str]]] = {
     "packages": packages,
     "package-matrix": package_matrix,
     "load-thresholds": load_thresholds,
+    "admission-limits": admission_limits,
     "error-definitions": error_definitions,
     "bench-goals": bench_goals,
 }

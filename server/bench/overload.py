@@ -13,6 +13,7 @@ break somebody's sound is asked for three times as many streams in the same mome
 import asyncio
 import time
 import urllib.request
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -60,7 +61,7 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
         before = await asyncio.to_thread(ask, port, "begin")
         await asyncio.sleep(duration_s)
         report = await asyncio.to_thread(ask, port, "report")
-        steps = await asyncio.to_thread(_steps_down, port)
+        told = await asyncio.to_thread(_metrics, port)
         memory_bytes = before["resident_bytes"]
         due = sum(report[name] for name in ("blocks_sent", "blocks_dropped", "blocks_missing"))
         return {
@@ -72,7 +73,10 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
             "least_retry_s": min((walker.retry_after_s or 0 for walker in refused), default=None),
             "most_retry_s": max((walker.retry_after_s or 0 for walker in refused), default=None),
             "late_share": min(1.0, count_late(report) / due) if due else 1.0,
-            "steps_down": steps,
+            "steps_down": told["nafir_level_steps_total", "load"],
+            "refused_for": {
+                reason: count for (name, reason), count in told.items() if name == "nafir_refusals_total" and count
+            },
             "streams": report["streams"],
             "pose_to_audio_ms": report["pose_to_audio_ms"],
             "pose_to_reverberation_ms": report["pose_to_reverberation_ms"],
@@ -104,13 +108,12 @@ def failures(measured: dict[str, Any]) -> list[str]:
     return found
 
 
-def _steps_down(port: int) -> int:
-    """How often streams have stepped down because of load."""
+def _metrics(port: int) -> Counter[tuple[str, str]]:
+    """The server's counts by metric and reason."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as answer:
         families = text_string_to_metric_families(answer.read().decode())
-    samples = (sample for family in families for sample in family.samples)
-    return sum(
-        int(sample.value)
-        for sample in samples
-        if sample.name == "nafir_level_steps_total" and sample.labels["reason"] == "load"
-    )
+    counts: Counter[tuple[str, str]] = Counter()
+    for sample in (sample for family in families for sample in family.samples):
+        if "reason" in sample.labels:
+            counts[sample.name, sample.labels["reason"]] += int(sample.value)
+    return counts

@@ -1,0 +1,102 @@
+"""Laws of the decision whether a newcomer fits."""
+
+from dataclasses import replace
+
+import pytest
+
+from server.streaming.headroom import (
+    LIMITS,
+    ServerLoad,
+    StreamCost,
+    ThreadLoad,
+    blocks_needed,
+    busy,
+    headroom,
+    obstacle,
+    obstacle_to_change,
+    retry_after_s,
+    seconds_to_next_ending,
+)
+from server.streaming.load_thresholds import THRESHOLDS
+
+EMPTY = ServerLoad((ThreadLoad(), ThreadLoad()), cores=2, workers=1, most_streams=64)
+QUIET = StreamCost(0.1, loop=0.01)
+
+
+def crowd(streams, cost=QUIET, load=EMPTY):
+    for number in range(streams):
+        load = load.plus(number % len(load.threads), cost)
+    return load
+
+
+def found(load, cost=QUIET):
+    return obstacle(LIMITS, THRESHOLDS, load, 0, cost)
+
+
+def test_a_stream_that_has_the_server_to_itself_always_fits():
+    assert found(EMPTY, StreamCost(50.0, loop=3.0, request_s=9.0)) is None
+
+
+def test_streams_are_let_in_until_a_thread_is_full_and_no_further():
+    most = next(number for number in range(100) if found(crowd(number)) is not None)
+    assert busy(LIMITS, crowd(most).threads[0], 8) > LIMITS.full_rendering - QUIET.rendering
+    assert all(found(crowd(number)) is None for number in range(most))
+
+
+def test_more_blocks_at_once_make_room_but_not_for_live_samples():
+    full = replace(EMPTY, threads=(ThreadLoad(ahead=0.9, streams=4), ThreadLoad()))
+    live = replace(EMPTY, threads=(ThreadLoad(live=0.75, streams=4), ThreadLoad()))
+    assert blocks_needed(LIMITS, THRESHOLDS, full.threads[0]) > 1
+    assert found(full, StreamCost(0.05)) is None
+    assert found(live, StreamCost(0.05)) == "rendering"
+
+
+@pytest.mark.parametrize(
+    ("load", "cost", "scarce"),
+    [
+        (replace(crowd(2), most_streams=2), QUIET, "streams"),
+        (replace(crowd(2), loop=0.69), StreamCost(0.0, loop=0.02), "event_loop"),
+        (replace(crowd(2), cores=1, loop=0.5), StreamCost(0.4, request_s=0.001, rate_hz=5.0), "cores"),
+        (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=30.0, patience_s=0.15, is_top=True), "responses"),
+        (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=2.0), "responses"),
+        (crowd(2), StreamCost(0.1, request_s=0.001, rate_hz=2.0, opening_s=0.2), "opening"),
+    ],
+)
+def test_what_is_scarce_is_named(load, cost, scarce):
+    assert found(load, cost) == scarce
+
+
+def test_what_makes_nothing_dearer_fits_on_a_full_server():
+    full = crowd(40)
+    assert obstacle_to_change(LIMITS, THRESHOLDS, full, 0, QUIET, replace(QUIET, rendering=0.05)) is None
+    assert obstacle_to_change(LIMITS, THRESHOLDS, full, 0, QUIET, replace(QUIET, rendering=0.15)) == "rendering"
+
+
+def test_headroom_falls_with_every_stream_to_nothing():
+    shares = [headroom(LIMITS, THRESHOLDS, crowd(number)) for number in range(30)]
+    assert shares[0] == 1.0
+    assert shares[-1] == 0.0
+    assert sorted(shares, reverse=True) == shares
+
+
+def test_a_stream_that_leaves_takes_its_cost_along():
+    cost = StreamCost(0.1, loop=0.01, request_s=0.002, rate_hz=12.0)
+    assert headroom(LIMITS, THRESHOLDS, crowd(5, cost).minus(0, cost).plus(0, cost)) == pytest.approx(
+        headroom(LIMITS, THRESHOLDS, crowd(5, cost))
+    )
+
+
+def test_refused_clients_come_back_apart_and_within_a_minute():
+    seconds = [retry_after_s(LIMITS, next_ending_s=2.0, waiting=10, luck=luck / 20) for luck in range(21)]
+    assert min(seconds) == 2
+    assert max(seconds) == 22
+    assert len(set(seconds)) > 10
+    assert retry_after_s(LIMITS, next_ending_s=1e6, waiting=1_000, luck=1.0) == LIMITS.most_retry_s
+
+
+def test_streams_that_end_often_make_waits_short():
+    often = seconds_to_next_ending(LIMITS, [90.0, 92.0, 94.0, 96.0, 98.0], 100.0, streams=20)
+    seldom = seconds_to_next_ending(LIMITS, [10.0, 50.0], 100.0, streams=20)
+    assert often == pytest.approx(2.0)
+    assert seldom == pytest.approx(45.0)
+    assert seconds_to_next_ending(LIMITS, [1.0], 1_000.0, streams=3) == LIMITS.usual_stay_s / 3
