@@ -3,9 +3,9 @@ loopback interface. The test belongs to the first node, which is the head; the o
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,8 +24,8 @@ _SLOWNESS = 20.0
 
 
 @contextmanager
-def ray_nodes(*cores: int) -> Iterator[Any]:
-    """A `ray.cluster_utils.Cluster` of nodes with so many cores each."""
+def ray_nodes(*cores: int, environment: Mapping[str, str] = MappingProxyType({})) -> Iterator[Any]:
+    """A `ray.cluster_utils.Cluster` of nodes with so many cores each, and these variables in their environment."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray._private import node
     from ray.cluster_utils import Cluster
@@ -36,6 +36,8 @@ def ray_nodes(*cores: int) -> Iterator[Any]:
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(node, "time", slow)
+            for name, value in environment.items():
+                patch.setenv(name, value)
             for number, count in enumerate(cores, start=2):
                 only_first = {"_system_config": _PATIENT} if number == 2 else {}
                 cluster.add_node(num_cpus=count, node_ip_address=f"127.0.0.{number}", **options, **only_first)

@@ -10,6 +10,7 @@ from training.data.dataset import Dataset
 from training.evaluation.draws import median_parameters
 from training.evaluation.evaluate import ONE_SIMULATION
 from training.evaluation.run import evaluate_bundles
+from training.parallel.jobs import LocalJobs
 from training.simulation.pairs import PairSimulation
 from training.simulation.references import References
 
@@ -99,12 +100,11 @@ def test_what_fewer_than_half_of_the_draws_have_is_missing(held_out, monkeypatch
         return parameters
 
     monkeypatch.setattr("training.evaluation.draws.measure", broken)
-    monkeypatch.setattr("training.evaluation.draws._WORKERS", 1)
     # One pair of an emitter of its own, so that calls come draw by draw; decays of 20 dB have draws of their own.
     emitters = held_out.held_out // len(held_out.simulated.probes)
     alone = next(index for index, emitter in enumerate(emitters) if np.count_nonzero(emitters == emitter) == 1)
     few = dataclasses.replace(held_out, held_out=held_out.held_out[[alone]], visible=held_out.visible[[alone]])
-    (parameters,) = median_parameters(few, 3, decay_db=20.0)
+    (parameters,) = median_parameters(few, 3, decay_db=20.0, jobs=LocalJobs(1))
     assert np.isfinite(parameters.reverberation_time_s).all()
     assert np.isfinite(parameters.clarity_db[..., 0]).all()
     assert np.isnan(parameters.clarity_db[..., 1]).all()
