@@ -78,7 +78,7 @@ class ReplicaApp:
     @property
     def headroom(self) -> float:
         """Share of the replica, from 0 to 1, that is free for more streams."""
-        return 1.0 - self._host.streams / self._host.settings.max_streams
+        return self._host.admission.headroom
 
     def begin_drain(self) -> None:
         """Accept nothing new, and tell all streams."""
