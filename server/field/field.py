@@ -274,7 +274,6 @@ class AcousticField:
             responses = self.impulse_responses(listeners, emitters, heads, remember=True)
             return np.ascontiguousarray(responses[..., :samples])
         listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
-        # guard: poses that are not finite have no first samples
         if not all(np.isfinite(part).all() for part in (listeners, emitters, heads)):
             raise ValueError("listeners, emitters and heads must be finite")
         return self._with_tail(listeners, emitters, heads, remember=True, samples=samples)

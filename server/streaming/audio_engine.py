@@ -177,6 +177,7 @@ class AudioEngine:
         """Stop rendering a stream; blocks made before may still be delivered. Closing twice does no harm."""
         thread = self._thread_of.pop(stream, None)
         if thread is not None:
+            self._balance_state = self._balance_state.without(stream)
             self._share_workers()
             thread.close(stream)
 

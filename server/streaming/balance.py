@@ -54,6 +54,11 @@ class BalanceState(Generic[Key]):
     periods: int = 0
     stays_until_s: Mapping[Key, float] = field(default_factory=dict)
 
+    def without(self, key: Key) -> "BalanceState[Key]":
+        """The same without a stream that has ended."""
+        stays = {each: until_s for each, until_s in self.stays_until_s.items() if each != key}
+        return replace(self, stays_until_s=stays)
+
 
 def balance(
     thresholds: Thresholds, state: BalanceState[Key], now_s: float, threads: Sequence[ThreadLoad[Key] | None]

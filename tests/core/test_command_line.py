@@ -73,7 +73,7 @@ def test_every_command_is_strict(module):
 
 
 INPUTS = {
-    *("bundle", "clip", "hrtf", "path"),
+    *("bundle", "clip", "costs", "hrtf", "path"),
     *("as_long_as", "data", "points", "predictions", "teacher"),
 }
 OUTPUTS = {"output", "figure"}
