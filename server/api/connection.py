@@ -18,7 +18,7 @@ import dataclasses
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -72,8 +72,6 @@ from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
 MAX_WAITING_ANSWERS = 256
-_MOST_WAIT_S, _LOOK_AGAIN_S = 0.6, 0.05
-"""How long a hello waits while others begin, and how often it looks again: it is to be answered within a second."""
 _GOODBYE_S = 1.0
 """Limit for sending the close frame. It waits for room in the socket, which a client that does not read never makes."""
 
@@ -264,7 +262,7 @@ class Connection:
             steps, others = self._steps(hello, levels, offer)
         except RequestError as refusal:
             return _refused(refusal)
-        place = await self._take_place(host.kind_of(hello, levels), steps, hello.emitters, others)
+        place = host.admission.admit(host.kind_of(hello, levels), steps, hello.emitters, others=others)
         if isinstance(place, Refusal):
             return _busy(place)
         try:
@@ -296,22 +294,6 @@ class Connection:
             error = Error(code="hello_expected", message=f"the first message is a hello, not {message.type}")
             return Goodbye(POLICY_VIOLATION, error)
         return message
-
-    async def _take_place(
-        self,
-        kind: StreamKind | None,
-        steps: Sequence[QualityStep],
-        emitters: int | None,
-        others: Sequence[QualityStep],
-    ) -> Place | Refusal:
-        """A place, or a refusal, after a moment if others are just beginning."""
-        admission, until_s = self._host.admission, self._time_s() + _MOST_WAIT_S
-        while self._time_s() < until_s:
-            answer = admission.try_to_admit(kind, steps, emitters, others=others, may_wait=True)
-            if answer is not None:
-                return answer
-            await asyncio.sleep(_LOOK_AGAIN_S)
-        return admission.admit(kind, steps, emitters, others=others)
 
     async def _require_offer(self, hello: Hello) -> tuple[FieldsByLevel, Offer | None]:
         """The levels that a hello may have, and their costs; None for these if the client has gone meanwhile. Raises

@@ -148,8 +148,7 @@ class Admission:
         self._refused_until_s: deque[float] = deque(maxlen=4 * most_streams)
         self._emitters: deque[int] = deque(maxlen=_SHOWN_EMITTERS)
         self._block_sent_s = limits.block_sent_s
-        self._opening_s, self._opened_s = 0.0, time_s()
-        """CPU time of first IRs that are still to be computed, and until when those computed are counted."""
+        self._opening_s = 0.0
         self._measured_s, self._measured_cpu_s = time_s(), 0.0
 
     @property
@@ -176,6 +175,7 @@ class Admission:
             # The event loop does other work too, so blocks take no more than what it took when it took least.
             seen_s = cpu_passed_s / passed_s / blocks_hz
             self._block_sent_s = min(seen_s, 1.01 * self._block_sent_s)
+        self._opening_s = max(0.0, self._opening_s - passed_s * self.spare_cores)
         self._learn(now_s)
         load = self.load()
         self.headroom = headroom(self._limits, self._thresholds, load)
@@ -191,8 +191,6 @@ class Admission:
     def load(self) -> ServerLoad:
         """Return what all streams take, those with a place but not opened yet included."""
         now_s = self._time_s()
-        opened_s, self._opened_s = now_s - self._opened_s, now_s
-        self._opening_s = max(0.0, self._opening_s - opened_s * self.spare_cores)
         by_thread = self._engine.streams_by_thread()
         numbers = {thread: number for number, thread in enumerate(self._engine.threads)}
         threads = [self._thread_load(thread, by_thread[thread], now_s) for thread in self._engine.threads]
@@ -244,23 +242,8 @@ class Admission:
         *,
         others: Sequence[QualityStep] = (),
     ) -> Place | Refusal:
-        """As `try_to_admit`, for whoever does not wait."""
-        answer = self.try_to_admit(kind, steps, emitters, others=others, may_wait=False)
-        assert answer is not None
-        return answer
-
-    def try_to_admit(
-        self,
-        kind: StreamKind | None,
-        steps: Sequence[QualityStep],
-        emitters: int | None,
-        *,
-        others: Sequence[QualityStep],
-        may_wait: bool,
-    ) -> Place | Refusal | None:
         """Return a place on the first of the `steps` on which a stream fits, which will have so many `emitters`, or as
-        many as streams had lately. If none fits, the refusal names a level of the `others` that does. Returns None if
-        the client `may_wait`, and there is room as soon as those who came before it have begun."""
+        many as streams had lately. If none fits, the refusal names a level of the `others` that does."""
         load = self.load()
         if load.streams >= self._most_streams:
             return self._refuse("hello", "streams")
@@ -274,8 +257,6 @@ class Admission:
             found = self._obstacle(load, thread, cost)
             if found is None:
                 return self._take(kind, step, thread, reserved, is_top=not number)
-            if found == "opening" and may_wait:
-                return None
         assert found is not None
         fitting = (
             step.level
