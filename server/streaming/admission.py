@@ -222,7 +222,7 @@ class Admission:
     def turn_away(self) -> Refusal | None:
         """Return a refusal if not even the cheapest stream fits."""
         load = self.load()
-        if load.streams >= self._most_streams:
+        if self.streams >= self._most_streams:
             return self._refuse("upgrade", "streams")
         if not (self._is_on and self._cheapest):
             return None
@@ -245,7 +245,7 @@ class Admission:
         """Return a place on the first of the `steps` on which a stream fits, which will have so many `emitters`, or as
         many as streams had lately. If none fits, the refusal names a level of the `others` that does."""
         load = self.load()
-        if load.streams >= self._most_streams:
+        if self.streams >= self._most_streams:
             return self._refuse("hello", "streams")
         thread = freest_thread(self._limits, load)
         reserved = max(1, self._usual_emitters if emitters is None else emitters)
