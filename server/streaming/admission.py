@@ -193,9 +193,8 @@ class Admission:
         now_s = self._time_s()
         by_thread = self._engine.streams_by_thread()
         numbers = {thread: number for number, thread in enumerate(self._engine.threads)}
-        threads = [self._thread_load(thread, by_thread[thread], now_s) for thread in self._engine.threads]
         load = ServerLoad(
-            threads=tuple(threads),
+            threads=tuple(self._own_load(thread, by_thread[thread]) for thread in self._engine.threads),
             cores=self._cores,
             workers=self._engine.workers,
             opening_s=self._opening_s,
@@ -203,8 +202,7 @@ class Admission:
         )
         for thread, streams in by_thread.items():
             for stream in streams:
-                # What it renders is in the thread's load already.
-                load = load.plus(numbers.get(thread, 0), replace(self._cost_of(stream, now_s), rendering=0.0))
+                load = load.plus(numbers.get(thread, 0), self._cost_of(stream, now_s))
         for place in self._places:
             if place.stream is None:
                 cost = self._expected(place, max(place.emitters, place.reserved))
@@ -430,15 +428,12 @@ class Admission:
             is_live=cost.is_live or expected.is_live,
         )
 
-    def _thread_load(self, thread: AudioThread, streams: list[Stream], now_s: float) -> ThreadLoad:
-        """Return what the streams of a thread take, and the thread's own work between them."""
+    def _own_load(self, thread: AudioThread, streams: list[Stream]) -> ThreadLoad:
+        """Return what a thread takes besides the blocks of its streams."""
         if not streams:
             return ThreadLoad()
         saved = saving(self._limits, thread.blocks_at_once)
-        load = ThreadLoad(ahead=max(0.0, thread.mean_busy - sum(stream.load for stream in streams)) / saved)
-        for stream in streams:
-            load = load.plus(self._cost_of(stream, now_s))
-        return load
+        return ThreadLoad(ahead=max(0.0, thread.mean_busy - sum(stream.load for stream in streams)) / saved)
 
     def _announce(self, load: ServerLoad) -> None:
         """Have each thread render as many blocks at once as it will need for those who come."""

@@ -58,6 +58,14 @@ def test_most_are_refused_and_told_when_to_come_back(name):
     assert len({refusal.retry_after_s for refusal in refused}) > 2
 
 
+@each
+def test_every_stream_is_counted_once(name):
+    server = overloaded(name)
+    load = server.admission.load()
+    assert load.streams == len(server.engine.streams) == server.admission.streams
+    assert load.streams > 0
+
+
 def test_without_admission_the_same_clients_break_the_sound():
     server = SimulatedServer(speeds=CORES["two slow cores"])
     server.arrive(60, at_s=1.0, every_s=0.02)
