@@ -147,6 +147,8 @@ class Stream:
         self._turns = RequestQueue(1)
         self.company = 1
         """The number of streams on the audio thread, including this one."""
+        self._began_s = -math.inf
+        """When the first block since the start plays."""
         self._worst_lateness_s = 0.0
         self._worst_sent_s = 0.0
         """The longest time from a block's due time until it was sent, since the last measurement; the sender writes
@@ -201,6 +203,7 @@ class Stream:
     def start(self, origin_s: float) -> None:
         """Start the clock: the next block, which is number 0 unless another thread has rendered some, plays at
         `origin_s`."""
+        self._began_s = origin_s
         first_s = origin_s - self.next_block * self.block_s
         self._clock = StreamClock(origin_s=first_s, block_s=self.block_s, lead=self._lead)
         self.due_s = self._clock.due_s(self.next_block)
@@ -313,7 +316,9 @@ class Stream:
     def note_sent(self, deadline_s: float, now_s: float) -> bool:
         """Note that a block is sent now; return whether it is late. The sender calls this: a block that is ready in
         time is of no use while the sender has no time."""
-        self._worst_sent_s = max(self._worst_sent_s, now_s - deadline_s + self._lead * self.block_s)
+        ahead_s = self._lead * self.block_s
+        if deadline_s >= self._began_s + ahead_s:  # the first blocks were due before the stream started
+            self._worst_sent_s = max(self._worst_sent_s, now_s - deadline_s + ahead_s)
         return now_s > deadline_s
 
     def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:

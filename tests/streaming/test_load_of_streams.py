@@ -15,10 +15,11 @@ from server.streaming.audio_engine import AudioEngine
 from server.streaming.load_policy import Ladder
 from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
-from server.streaming.stream import Stream
+from server.streaming.stream import Stream, TimedBlock
 
 BLOCK = 1024  # long ones, since many seconds are rendered here
 BLOCK_S = BLOCK / 24_000
+LEAD = 8
 
 
 class Room:
@@ -82,7 +83,7 @@ class Stage:
         session = Session(hello, levels, filters, lambda _: clip, quality=ladder.step, window=100_000)
         self.delivered = []
         self.stream = Stream(
-            session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=8, deliver=self.delivered.extend
+            session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=LEAD, deliver=self.delivered.extend
         )
         self.engine.open(self.stream)
         self.stream.offer(AddEmitter(id="a", clip="any", position=(2.0, 3.0, 1.5)))
@@ -158,6 +159,29 @@ def test_a_level_is_chosen_kept_and_given_back_to_the_server(stage):
     stage.stream.offer(SetLevel(level="auto"))
     stage.run(0.5)
     assert stage.changes[-1] == ("fine", "chosen")
+
+
+def test_a_block_counts_as_late_by_when_it_is_sent_but_those_before_the_start_do_not(stage):
+    """A stream renders its first blocks one after the other, when they are due already."""
+    stage.run(4.0)
+    blocks = [item for item in stage.delivered if isinstance(item, TimedBlock)]
+    stage.stream.sample_load(stage.clock.now_s)
+    assert not any(stage.stream.note_sent(each.deadline_s, each.deadline_s - BLOCK_S / 2) for each in blocks[:LEAD])
+    assert stage.stream.sample_load(stage.clock.now_s).lateness == 0.0
+    due_s = blocks[LEAD].deadline_s - LEAD * BLOCK_S
+    assert not stage.stream.note_sent(blocks[LEAD].deadline_s, due_s + 2 * BLOCK_S)
+    assert stage.stream.sample_load(stage.clock.now_s).lateness == pytest.approx(2 / LEAD)
+    assert stage.stream.note_sent(blocks[-1].deadline_s, blocks[-1].deadline_s + BLOCK_S)
+    assert stage.stream.sample_load(stage.clock.now_s).lateness == pytest.approx(1 + 1 / LEAD)
+
+
+def test_what_is_sent_late_lowers_quality_as_what_is_rendered_late_does(stage):
+    stage.run(1.0)
+    for _ in range(20):
+        newest = next(item for item in reversed(stage.delivered) if isinstance(item, TimedBlock))
+        stage.stream.note_sent(newest.deadline_s, newest.deadline_s - BLOCK_S)
+        stage.run(0.25)
+    assert {reason for _, reason in stage.changes} == {"load"}
 
 
 def test_a_level_there_is_not_is_refused_and_changes_nothing(stage):
