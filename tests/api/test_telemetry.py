@@ -12,7 +12,7 @@ from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
-from server.streaming.admission import Admission
+from server.streaming.admission import Admission, Refusal
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.load_policy import Ladder, RenderAhead, ThreadState
 from server.streaming.quality_steps import Offer
@@ -157,6 +157,7 @@ def test_headroom_and_refusals_by_reason_are_told(host, field, filters):
     assert samples(host)["nafir_headroom",] == 1.0
     assert samples(host)["nafir_refusals_total", ("asked", "upgrade"), ("reason", "streams")] == 0
     open_stream(host, field, filters)
+    assert not isinstance(host.admission.admit(None, host.offers["flat"].steps("auto", block_s=BLOCK_S)), Refusal)
     host.admission.turn_away()
     host.admission.measure()
     assert samples(host)["nafir_headroom",] == 0.0
