@@ -65,7 +65,7 @@ class AnySizeConvolver:
     def want(self, source: int, filters: SpectralFilter) -> None:
         self._wanted[source] = filters
 
-    def want_shared(self, filters: SpectralFilter) -> None:
+    def want_shared(self, filters: SpectralFilter | None) -> None:
         self._shared_wanted[0] = filters
 
     def take_in(self, number: int, own: bool, shared: FloatArray, at_once: npt.NDArray[np.bool]) -> None:

@@ -100,9 +100,9 @@ class CompiledConvolver:
     def want(self, source: int, filters: PackedFilter) -> None:
         self._wanted[source] = filters.address
 
-    def want_shared(self, filters: PackedFilter) -> None:
+    def want_shared(self, filters: PackedFilter | None) -> None:
         for wanted in self._shared_wanted.values():
-            wanted[0] = filters.address
+            wanted[0] = 0 if filters is None else filters.address
 
     def take_in(self, number: int, own: bool, shared: FloatArray, at_once: npt.NDArray[np.bool]) -> None:
         """From the next block on, take inputs into the stage of this number of each source if `own`, and into the

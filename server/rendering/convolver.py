@@ -237,8 +237,7 @@ class Convolver:
         if self._shared is not None and self._shared is not shared:
             self._retire(self._shared)
         self._shared = shared
-        if shared is not None:
-            self._engine.want_shared(shared.filters)
+        self._engine.want_shared(None if shared is None else shared.filters)
         gains = np.sqrt(energies / energies[at]) if energies[at] > 0 else np.zeros(self.sources)
         newcomers = self._came_at == self._engine.blocks
         for number in self._shareable:
