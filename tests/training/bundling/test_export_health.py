@@ -12,10 +12,27 @@ from server.scene.bundle import Bundle
 from training.bundling import export as export_module
 from training.bundling.data_reference import reference_of
 from training.bundling.export import ExportError, export
+from training.bundling.graphs import with_weights
 from training.learning.train import load_learner
+from training.models.factorised import ExportedField
 from training.simulation.responses import SimulatedResponses
 
 
+@pytest.fixture
+def without_tracing(dataset, run, monkeypatch):
+    """The graph of the field as it was trained, with the values of the one that is exported: only these differ. Nor is
+    the graph compared with the field."""
+    healthy, to_onnx = load_learner(SimulatedResponses(dataset), run), export_module.to_onnx
+
+    def graph(module, poses, outputs, **options):
+        trained = ExportedField(healthy.field, healthy.cells).eval()
+        return with_weights(to_onnx(trained, poses, outputs, **options), module)
+
+    monkeypatch.setattr(export_module, "to_onnx", graph)
+    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)
+
+
+@pytest.mark.usefixtures("without_tracing")
 @pytest.mark.parametrize(
     ("excess", "error", "problem"),
     [
@@ -32,7 +49,6 @@ def test_a_field_that_breaks_a_law_is_refused_and_nothing_is_written(
         return learner
 
     monkeypatch.setattr(export_module, "load_learner", ill)
-    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)  # the graph does what the field does
     with pytest.raises(error, match=problem):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
@@ -48,9 +64,9 @@ def _rising(responses, folder):
     return learner
 
 
+@pytest.mark.usefixtures("without_tracing")
 def test_a_broken_law_may_be_accepted_with_a_reason_that_the_bundle_keeps(dataset, run, tmp_path, monkeypatch):
     monkeypatch.setattr(export_module, "load_learner", _rising)
-    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)
     with pytest.raises(HealthError, match=r"rise within 60 dB of decay.*--accept decay='why'"):
         export(SimulatedResponses(dataset), [run], tmp_path / "refused")
     reasons = {"decay": "the room has an echo", "peak": "not broken at all"}
@@ -79,12 +95,12 @@ def test_what_nobody_may_accept_is_refused_before_any_work(dataset, tmp_path, ac
         export(SimulatedResponses(dataset), [tmp_path / "no run"], tmp_path / "bundle", accepted=accepted)
 
 
+@pytest.mark.usefixtures("without_tracing")
 def test_a_field_is_checked_before_its_noise_is_chosen(dataset, run, tmp_path, monkeypatch):
     def choose(*_, **__):
         raise AssertionError("noise was chosen for a field that is refused")
 
     monkeypatch.setattr(export_module, "load_learner", _rising)
-    monkeypatch.setattr(export_module, "_check", lambda *_, **__: None)
     monkeypatch.setattr(export_module, "choose_noise", choose)
     with pytest.raises(HealthError):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
