@@ -61,7 +61,7 @@ serve: $(VENV)/installed-server ## install the server and open a scene at http:/
 
 test: lint ## install what tests need, then lint, check types and run all tests but the long
 	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long and not cluster'
-	$(BIN)/pytest $(TIMED) -m 'timed and not attack and not cluster'
+	$(BIN)/pytest $(TIMED) -m 'timed and not attack and not long and not cluster'
 
 lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .
@@ -105,8 +105,9 @@ paper: $(SCENES:%=paper-of-%) paper-fractions $(if $(DATA),paper-office) ## the 
 own-scenes: | $(VENV)/installed-training ## bundles of eleven scenes of many kinds, and how long they ring beside other simulations: runs/own-scenes.md
 	$(BIN)/python -m training.trials.own_scenes runs/own-scenes
 
-long: $(VENV)/installed-dev ## tests that take very long for what they may find: recipes followed to the end, scenes at random
-	$(BIN)/pytest --numprocesses auto --dist worksteal -m long
+long: $(VENV)/installed-dev ## tests that take very long for what they may find: recipes followed to the end, a longer soak
+	$(BIN)/pytest --numprocesses auto --dist worksteal -m 'long and not timed'
+	$(BIN)/pytest $(TIMED) -m 'long and timed'
 
 attacks: $(VENV)/installed-dev ## attack a server in every way we know while somebody listens: none of it may be heard
 	$(BIN)/pytest -m attack

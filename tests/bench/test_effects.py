@@ -1,5 +1,6 @@
 """Plans prove themselves in six situations, in both directions: what is off is not missed, and what is on would be."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +13,11 @@ from server.bench.statistical_field import SAMPLE_RATE, Room, StatisticalField, 
 from server.planning.places import reverberation_of
 from server.scene.effects import EffectName
 
-SITUATIONS = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
+*FEW, HALL = SCENARIOS
+FOUR = replace(HALL, name="four emitters in a hall", emitters=HALL.emitters[::5])
+SITUATIONS = pytest.mark.parametrize(
+    "scenario", [*FEW, FOUR, pytest.param(HALL, marks=pytest.mark.long)], ids=lambda scenario: scenario.name
+)
 
 
 @cache

@@ -30,8 +30,10 @@ def schemathesis(address, folder, *, config, examples):
 
 @pytest.mark.parametrize(
     ("config", "examples"),
-    [("", 5), ('[parameters]\n"path.scene" = "flat"\n', 10)],
-    ids=["any scene, which there is hardly ever", "a scene there is"],
+    [
+        pytest.param("", 5, id="any scene, which there is hardly ever", marks=pytest.mark.long),
+        pytest.param('[parameters]\n"path.scene" = "flat"\n', 10, id="a scene there is"),
+    ],
 )
 def test_the_server_is_as_its_document_says(served, tmp_path, config, examples):
     ran = schemathesis(served, tmp_path, config=config, examples=examples)

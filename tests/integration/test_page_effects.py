@@ -10,7 +10,7 @@ browser = visitor.browser
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.long)])
 def test_what_is_rendered_is_shown_with_reasons_and_can_be_switched(browser, server, width):
     context = browser.new_context(viewport={"width": width, "height": 900})
     page = open_page(context, server)

@@ -38,7 +38,7 @@ def several_levels(tmp_path_factory) -> Iterator[str]:
         yield url
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.long)])
 def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, several_levels, width):
     context = browser.new_context(viewport={"width": width, "height": 800})
     page = open_page(context, several_levels)
