@@ -10,6 +10,8 @@ from training.simulation.planner import planner_of
 from training.simulation.run import prepared
 
 RATES = (8_000, 8_001, 11_025, 16_000, 22_050, 44_100, 48_000, 96_000)
+FEW_RATES = (8_001, 44_100, 96_000)
+"""One with a band less, a usual one and the highest."""
 
 
 @pytest.mark.parametrize(("sample_rate", "bands"), list(zip(RATES, (6, 6, 6, 7, 7, 7, 7, 7), strict=True)))
@@ -19,7 +21,13 @@ def test_bands_within_begin_below_half_the_rate(sample_rate, bands):
 
 
 @pytest.mark.parametrize(
-    ("sample_rate", "has_own_tails"), [*((rate, False) for rate in RATES), (8_000, True), (96_000, True)]
+    ("sample_rate", "has_own_tails"),
+    [
+        *((rate, False) for rate in FEW_RATES),
+        *(pytest.param(rate, False, marks=pytest.mark.long) for rate in RATES if rate not in FEW_RATES),
+        (8_000, True),
+        pytest.param(96_000, True, marks=pytest.mark.long),
+    ],
 )
 def test_every_rate_simulates_the_same_room(tiny_scene, reference_energy, sample_rate, has_own_tails):
     """Below 2 kHz a response has, at every rate, the energy that rays and images bring: it is found in the response's

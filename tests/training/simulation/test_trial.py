@@ -36,7 +36,7 @@ def test_long_rooms_ring_on_by_rays_of_which_there_are_few():
     np.testing.assert_allclose(trial.reverberation_time_s, expected, rtol=0.25)
 
 
-@pytest.mark.parametrize("name", ["small1", "small2"])
+@pytest.mark.parametrize("name", ["small1", pytest.param("small2", marks=pytest.mark.long)])
 def test_places_of_one_small_room_share_their_late_sound(name):
     """By sixty-four times as many rays sharing changes 0.09 JND in `small1`."""
     scene = SceneFile.read(SCENES / f"{name}.toml")
