@@ -102,7 +102,7 @@ class Settings(BaseSettings):
     if rendering leaves less."""
     max_streams: Annotated[int, Field(ge=1)] = 64
     """Live streams that may be open at once; one more is refused with `server_busy`."""
-    admission: bool = False
+    admission: bool = True
     """Whether a stream, an emitter, a level or an effect is refused (`server_busy`) where it would break somebody's
     sound. Without it only `max_streams` limits them, and under load all streams lose quality together."""
     shared_tail: bool = False

@@ -18,7 +18,7 @@ from http import HTTPStatus
 from itertools import zip_longest
 from typing import Any, Final
 
-from uvicorn._types import ASGIReceiveEvent
+from uvicorn._types import ASGIReceiveEvent, ASGISendEvent
 from uvicorn.config import Config
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
@@ -279,6 +279,12 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
                 # Not at once: the next message would be handled before this one is returned.
                 self._next_slice = self.loop.call_soon(self._go_on)
         return message
+
+    async def send(self, message: ASGISendEvent) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.http.response.body" and not message.get("more_body", False):
+            # A refusal is an answer too; uvicorn would report an application that gave none.
+            self.handshake_complete = True
 
     def _spend(self, messages: float, nbytes: int = 0) -> None:
         now_s = self.loop.time()

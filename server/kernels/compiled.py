@@ -41,7 +41,7 @@ def compiled_in_place(function: Function) -> Function:
     """As `compiled`, for functions that allocate no arrays and store none, but only work in arrays of their callers. In
     short loops over many arrays, reference counting is a tenth of all work, and is left out here. A function that
     allocates does not compile."""
-    return _compile(function, _nrt=False)
+    return _compile(function, _nrt=False, forceinline=True)
 
 
 def _compile(function: Function, **more: bool) -> Function:

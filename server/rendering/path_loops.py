@@ -165,8 +165,9 @@ def locate(
     is the polynomial with coefficients `a` at i + 1."""
     turn, last = float(ring), np.int32(PHASES - 1)
     for i in range(first.size):
-        u = i + 1.0
-        at = start + i - (a0 + u * (a1 + u * (a2 + u * a3)))
+        n = float(np.int32(i))
+        u = n + 1.0
+        at = start + n - (a0 + u * (a1 + u * (a2 + u * a3)))
         at += 0.0 if at >= 0.0 else turn
         # 32 bits, because processors convert several such values at once.
         whole = np.int32(at)

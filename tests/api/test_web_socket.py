@@ -10,7 +10,8 @@ import pytest
 import uvicorn
 from websockets.asyncio.client import connect
 from websockets.client import ClientProtocol
-from websockets.frames import Frame, Opcode
+from websockets.exceptions import InvalidStatus
+from websockets.frames import CloseCode, Frame, Opcode
 from websockets.uri import parse_uri
 
 from server.api.inflow import Allowance
@@ -21,16 +22,18 @@ PROTOCOL = "server.api.web_socket:WebSocketProtocol"
 
 
 @asynccontextmanager
-async def serving(application, ws=PROTOCOL, **more):
-    """The address of a server that runs `application(scope, receive, send)` for every connection, once accepted."""
+async def serving(application, ws=PROTOCOL, accepts=True, **more):
+    """The address of a server that runs `application(scope, receive, send)` for every connection, which it `accepts` or
+    leaves to the application."""
 
     async def accepted(scope, receive, send):
         await receive()
         await send({"type": "websocket.accept"})
         await application(scope, receive, send)
 
-    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", "log_level": "warning", **more}
-    server = uvicorn.Server(uvicorn.Config(accepted, **options, timeout_graceful_shutdown=1))
+    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", "log_config": None, **more}
+    asgi = accepted if accepts else application
+    server = uvicorn.Server(uvicorn.Config(asgi, **options, timeout_graceful_shutdown=1))
     running = asyncio.create_task(server.serve())
     while not server.started:  # noqa: ASYNC110  it has no event for it
         await asyncio.sleep(0.01)
@@ -170,6 +173,24 @@ def test_what_is_heard_at_once_and_what_waits_stay_in_order():
     assert dict(heard)["wait"] == dict(heard)["in parts"] == "waited"
 
 
+def test_a_refusal_is_an_answer_and_no_error_of_the_application(caplog):
+    async def refuse(_scope, receive, send):
+        await receive()
+        await send({"type": "websocket.http.response.start", "status": 503, "headers": []})
+        await send({"type": "websocket.http.response.body", "body": b"full", "more_body": True})
+        await send({"type": "websocket.http.response.body", "body": b" today"})
+
+    async def ask():
+        async with serving(refuse, accepts=False) as address:
+            with pytest.raises(InvalidStatus) as refused:
+                await connect(address)
+            return refused.value.response
+
+    response = asyncio.run(ask())
+    assert (response.status_code, response.body) == (503, b"full today")
+    assert not [record for record in caplog.records if record.levelname != "INFO"]
+
+
 def test_text_that_is_none_closes_the_connection():
     """As it does without anybody who listens."""
 
@@ -287,7 +308,8 @@ def test_a_client_that_is_still_sending_learns_why_the_connection_closes(breach,
 
     assert asyncio.run(talk()).code == reason
     assert not heard
-    assert not caplog.records
+    told = [record.message for record in caplog.records if record.levelname != "INFO"]
+    assert told == (["Invalid UTF-8 sequence received from client."] if reason == CloseCode.INVALID_DATA else [])
 
 
 def _binary_pose(number):

@@ -23,6 +23,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
+from sklearn.manifold import TSNE
+from sklearn.preprocessing import StandardScaler
 
 from server.acoustics.geometry import FloorPlan
 from training.baselines.held_out import EvaluationError
@@ -30,7 +32,6 @@ from training.data.dataset import Dataset
 from training.evaluation.decoding import RidgeRegression
 from training.evaluation.maps import Simulator, spread_out
 from training.evaluation.mfcc import mfcc
-from training.evaluation.tsne import tsne
 from training.learning.kinds import learner_of
 from training.learning.naf import NafLearner
 from training.learning.runs import Configuration
@@ -208,7 +209,8 @@ def _read(features: _Floats, distance_m: _Floats, fitted: int, seed: int) -> Rea
     predicted = reader.predict(on_grid)
     colours = None
     if len(on_grid) > 2 * _PERPLEXITY:
-        reduced = tsne(on_grid, perplexity=_PERPLEXITY, seed=seed)
+        embedding = TSNE(n_components=3, perplexity=_PERPLEXITY, random_state=seed)
+        reduced = embedding.fit_transform(StandardScaler().fit_transform(on_grid))
         low, high = reduced.min(axis=0), reduced.max(axis=0)
         colours = (reduced - low) / np.maximum(high - low, 1e-9)
     return Read(predicted, explained_variance(true, predicted), float(np.abs(predicted - true).mean()), colours)
