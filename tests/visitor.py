@@ -118,8 +118,20 @@ def browser():
         browser.close()
 
 
+_COARSE_MAPS = """{
+  const fetched = window.fetch;
+  window.fetch = (asked, ...options) => {
+    if (asked instanceof URL && asked.pathname.endsWith("/loudness")) asked.searchParams.set("spacing_m", "1");
+    return fetched(asked, ...options);
+  };
+}"""
+"""The usual map takes a dozen seconds of a core, as often as a page is opened. `test_page_scenes.py` asks for it."""
+
+
 def open_page(context, url: str):
+    """With coarse maps of loudness."""
     page = context.new_page()
+    page.add_init_script(_COARSE_MAPS)
     page.goto(url)
     page.evaluate("nafir.ready")
     return page

@@ -125,7 +125,7 @@ def test_dragging_and_keys_move_what_they_should(page):
     drag(".knob", x - handle_x, y - 80 - handle_y)
     assert page.evaluate("nafir.state().listener.yaw") == pytest.approx(math.pi / 2, abs=0.15)
 
-    # A map takes a dozen seconds of a core, behind everything else.
+    # Behind everything else.
     with page.expect_response(lambda response: "/loudness" in response.url, timeout=120_000) as mapped:
         drag("[data-emitter=A] .disc", 30, 30)
     assert mapped.value.ok

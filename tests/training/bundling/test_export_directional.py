@@ -96,7 +96,7 @@ def test_every_form_is_heard(alone):
 
 
 def test_it_shares_a_bundle_with_a_field_of_ears(dataset, run, directional_run, tmp_path):
-    bundle = export(SimulatedResponses(dataset), [run, directional_run], tmp_path / "bundle")
+    bundle = export(SimulatedResponses(dataset), [run, directional_run], tmp_path / "bundle", checked=False)
     fields = bundle.manifest.fields
     assert {name: field.predicts for name, field in fields.items()} == {
         "factorised": "ears",
@@ -111,9 +111,9 @@ def test_it_shares_a_bundle_with_a_field_of_ears(dataset, run, directional_run, 
 def test_order_zero_has_one_output(dataset, configuration, tmp_path):
     recipe = DirectionalRecipe(order=0)
     responses = SimulatedResponses(dataset)
-    settings = Configuration.directional(configuration.shape, recipe, epochs=60, batch=8)
+    settings = Configuration.directional(configuration.shape, recipe, epochs=1, batch=8)
     train(responses, tmp_path / "run", settings, SILENT)
-    bundle = export(responses, [tmp_path / "run"], tmp_path / "bundle")
+    bundle = export(responses, [tmp_path / "run"], tmp_path / "bundle", checked=False)
     session = open_session(bundle.models["directional.onnx"])
     assert [each.name for each in session.get_outputs()] == ["log_magnitude"]
     assert bundle.manifest.fields["directional"].order == 0

@@ -62,20 +62,24 @@ def evaluated(held_out):
     return evaluated
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def draw(held_out, columns, evaluated):
-    """The figure of these columns, of so many pairs that there were."""
+    """The figure of these columns, of so many pairs that there were; drawn once for all tests."""
+    figures = {}
 
     def drawn(of=None, *, columns=columns):
-        return figure_of(
-            evaluated(columns, of),
-            references=held_out.reference,
-            reference_name="measured response",
-            columns={each.name: each.source for each in columns if each.name in {LEVEL, "nearest"}},
-            yaw_index=np.array([0]),
-            examples=[(0, "in sight, 1.5 m"), (1, "in sight, 3.5 m"), (2, "round the corner, 12.5 m")],
-            sample_rate=RATE,
-        )
+        asked = of, tuple(each.name for each in columns)
+        if asked not in figures:
+            figures[asked] = figure_of(
+                evaluated(columns, of),
+                references=held_out.reference,
+                reference_name="measured response",
+                columns={each.name: each.source for each in columns if each.name in {LEVEL, "nearest"}},
+                yaw_index=np.array([0]),
+                examples=[(0, "in sight, 1.5 m"), (1, "in sight, 3.5 m"), (2, "round the corner, 12.5 m")],
+                sample_rate=RATE,
+            )
+        return figures[asked]
 
     return drawn
 

@@ -2,6 +2,7 @@ import io
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from training.frontier.sweep import Effort, record, sweep, with_levels
 from training.frontier.walk import POSES_PER_S, SPEED_M_PER_S, walk
 
 EFFORT = Effort(pairs=4, yaws=4, walk_s=12.0)
+WITH_A_SHORT_WALK = replace(EFFORT, walk_s=2.0)
+"""For tests that look at accuracy alone."""
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +88,7 @@ def test_levels_are_chosen_by_one_half_and_reported_on_the_other(tiny_bundle, da
         return taken[pairs][-1]
 
     monkeypatch.setattr(SampledPairs, "errors_of", told)
-    found = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
+    found = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, WITH_A_SHORT_WALK, Progress(disable=True))
     assert len(taken) == 2  # no more samples than halves
     probes = {half: dataset.probes[dataset.held_out_half(half)].reshape(-1, 6) for half in ("choice", "report")}
     for half, is_reported in (("choice", False), ("report", True)):
@@ -103,21 +106,21 @@ def test_costs_are_measured_in_one_run(frontier) -> None:
 
 
 def test_what_was_measured_is_not_measured_again(tiny_bundle, dataset, chosen, tmp_path, monkeypatch) -> None:
-    first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
+    first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, WITH_A_SHORT_WALK, Progress(disable=True))
     kept = json.loads((tmp_path / "accuracy.json").read_text())
     monkeypatch.setattr(Estimate, "__call__", lambda *_: pytest.fail("measured again"))
-    again = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, EFFORT, Progress(disable=True))
+    again = sweep(tiny_bundle, dataset, chosen[:1], tmp_path, WITH_A_SHORT_WALK, Progress(disable=True))
     assert again.best[0].accuracy == first.best[0].accuracy
     assert json.loads((tmp_path / "accuracy.json").read_text()) == kept
 
 
 def test_with_another_noise_it_is_measured_again(tiny_bundle, dataset, chosen, tmp_path) -> None:
-    first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path / "frontier", EFFORT, Progress(disable=True))
+    first = sweep(tiny_bundle, dataset, chosen[:1], tmp_path / "frontier", WITH_A_SHORT_WALK, Progress(disable=True))
     arrays = io.BytesIO()
     np.savez(arrays, frozen_noise=0.5 * tiny_bundle.frozen_noise)
     files = {name: (tiny_bundle.folder / name).read_bytes() for name in tiny_bundle.manifest.files}
     other = write_bundle(tmp_path / "bundle", tiny_bundle.manifest, {**files, ARRAYS_FILE: arrays.getvalue()})
-    again = sweep(other, dataset, chosen[:1], tmp_path / "frontier", EFFORT, Progress(disable=True))
+    again = sweep(other, dataset, chosen[:1], tmp_path / "frontier", WITH_A_SHORT_WALK, Progress(disable=True))
     assert again.best[0].accuracy.errors["level"] != first.best[0].accuracy.errors["level"]
 
 
