@@ -5,7 +5,7 @@ import pytest
 import torch
 from rich.progress import Progress
 
-from tests.training.conftest import one_thread  # noqa: F401 - sums in parallel are not repeatable
+from tests.training.conftest import one_thread, single_precision  # noqa: F401 - else not repeatable
 from training.data.importers.report import ImportReport
 from training.data.responses import ImportedDataset, Measurement
 from training.learning.runs import Configuration, NafRecipe
@@ -22,14 +22,6 @@ KINDS = pytest.mark.parametrize(
     "configuration", [pytest.param(FACTORISED, id="factorised"), pytest.param(NAF, id="naf")]
 )
 GRID = [((float(x), float(y), 1.5), (1.4, 1.6, 1.2)) for x in range(4) for y in range(3)]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_precision():
-    """The clock decides between precisions, and on a busy machine not always alike."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("training.learning.train.bfloat16_gains", lambda *_: False)
-        yield
 
 
 def response(seed, samples=SAMPLES):

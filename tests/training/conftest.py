@@ -1,6 +1,7 @@
 """The smallest scene, simulated, trained and exported once for all tests."""
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from server.health.check import Effort
 from server.rendering import hrtf
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
+from tests.once_a_run import once
 from tests.training.held_out import make_held_out  # noqa: F401  a fixture
 from tests.training.traced_once import traced_once
 from training.bundling import export as export_module
@@ -20,7 +22,7 @@ from training.bundling import noise
 from training.bundling.export import export
 from training.data.dataset import Dataset
 from training.data.scene_file import SceneFile
-from training.learning.runs import Configuration
+from training.learning.runs import Configuration, claim
 from training.learning.train import train
 from training.models.encoders import FieldShape
 from training.parallel.jobs import LocalJobs
@@ -75,6 +77,14 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def single_precision() -> Iterator[None]:
+    """The clock decides between precisions, and on a busy machine not always alike."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.learning.train.bfloat16_gains", lambda *_: False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _few_draws() -> Iterator[None]:
     """Of noise, for bundles that nobody listens to."""
     with pytest.MonkeyPatch.context() as patch:
@@ -109,19 +119,34 @@ def _tried_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def dataset(tmp_path_factory) -> Dataset:
-    folder = tmp_path_factory.mktemp("tiny") / "data"
-    return simulate(TINY, folder, seed=5, jobs=LocalJobs(1), progress=Progress(disable=True))
+def _copy(name: str, build: Callable[[Path], object], factory: pytest.TempPathFactory) -> Path:
+    """What `build` makes once for all workers, for this one to work on."""
+    return shutil.copytree(once(name, build, factory), factory.mktemp("tiny") / name)
 
 
 @pytest.fixture(scope="session")
-def run(dataset, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("tiny") / "run"
-    train(SimulatedResponses(dataset), folder, CONFIGURATION, Progress(disable=True))
-    return folder
+def _data_and_run(tmp_path_factory) -> Path:
+    def build(folder: Path) -> None:
+        made = simulate(TINY, folder / "data", seed=5, jobs=LocalJobs(1), progress=Progress(disable=True))
+        train(SimulatedResponses(made), folder / "run", CONFIGURATION, Progress(disable=True))
+
+    return _copy("trained", build, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def dataset(_data_and_run) -> Dataset:
+    return Dataset.open(_data_and_run / "data")
+
+
+@pytest.fixture(scope="session")
+def run(_data_and_run, dataset) -> Path:
+    claim(_data_and_run / "run", SimulatedResponses(dataset), CONFIGURATION)  # of this worker's copy of the data
+    return _data_and_run / "run"
 
 
 @pytest.fixture(scope="session")
 def tiny_bundle(dataset, run, tmp_path_factory) -> Bundle:
-    return export(SimulatedResponses(dataset), [run], tmp_path_factory.mktemp("tiny") / "bundle")
+    def build(folder: Path) -> None:
+        export(SimulatedResponses(dataset), [run], folder / "bundle")
+
+    return Bundle.load(_copy("exported", build, tmp_path_factory) / "bundle")
