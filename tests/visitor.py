@@ -121,11 +121,13 @@ def browser():
 _COARSE_MAPS = """{
   const fetched = window.fetch;
   window.fetch = (asked, ...options) => {
-    if (asked instanceof URL && asked.pathname.endsWith("/loudness")) asked.searchParams.set("spacing_m", "1");
+    if (asked instanceof URL && asked.pathname.endsWith("/loudness") && !asked.pathname.includes("/open-field/"))
+      asked.searchParams.set("spacing_m", "1");
     return fetched(asked, ...options);
   };
 }"""
-"""The usual map takes a dozen seconds of a core, as often as a page is opened. `test_page_scenes.py` asks for it."""
+"""The usual map takes a dozen seconds of a core, as often as a page is opened. `test_page_scenes.py` asks for it. An
+open field has a coarser one."""
 
 
 def open_page(context, url: str):
