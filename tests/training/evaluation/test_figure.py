@@ -68,10 +68,11 @@ def draw(held_out, columns, evaluated):
     figures = {}
 
     def drawn(of=None, *, columns=columns):
-        asked = of, tuple(each.name for each in columns)
+        evaluation = evaluated(columns, of)
+        asked = evaluation.held_out, tuple(each.name for each in columns)
         if asked not in figures:
             figures[asked] = figure_of(
-                evaluated(columns, of),
+                evaluation,
                 references=held_out.reference,
                 reference_name="measured response",
                 columns={each.name: each.source for each in columns if each.name in {LEVEL, "nearest"}},

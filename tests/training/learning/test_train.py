@@ -295,7 +295,7 @@ def test_minutes_end_a_run_and_count_over_its_pieces(dataset, configuration, tmp
     assert losses(tmp_path, "seconds")[-1] >= 7.5
 
 
-@pytest.mark.parametrize(("look_s", "least_s"), [(0.5, 40), (4.0, 15)])
+@pytest.mark.parametrize(("look_s", "least_s"), [pytest.param(0.5, 40, marks=pytest.mark.long), (4.0, 15)])
 def test_minutes_count_looks_at_what_is_held_back_and_every_round_trains(
     dataset, configuration, tmp_path, keep_time, look_s, least_s
 ):
@@ -406,26 +406,58 @@ def test_a_run_that_diverges_says_so_and_keeps_its_checkpoint(dataset, configura
     assert all(np.isfinite(losses(tmp_path, "training")))
 
 
-def test_two_processes_learn_what_one_does(dataset, configuration, tmp_path):
+TRAINING_OF_ARGUMENTS = """
+import os, socket, sys, torch
+from pathlib import Path
+from rich.progress import Progress
+from training.simulation.responses import open_responses
+from training.learning.runs import Configuration
+from training.learning import train as train_module
+torch.set_num_threads(1)
+train_module.bfloat16_gains = lambda *_: False
+def go_on():
+    run = Path(sys.argv[2])
+    responses = open_responses(Path(sys.argv[1]))
+    train_module.train(responses, run.parent / "two", Configuration.read(run), Progress(disable=True))
+"""
+AS_ONE_OF_TWO = "go_on()"
+AS_BOTH = """
+with socket.create_server(("127.0.0.1", 0)) as probe:
+    port = str(probe.getsockname()[1])
+os.environ.update(WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=port)
+other = os.fork()
+os.environ["RANK"] = os.environ["LOCAL_RANK"] = "0" if other else "1"
+go_on()
+if other:
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(other, 0)[1]))
+"""
+"""What torchrun does, and imports are done once for both."""
+
+
+@pytest.mark.parametrize(
+    ("launcher", "start"),
+    [
+        pytest.param((), AS_BOTH, id="told by the environment"),
+        pytest.param(
+            ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+            AS_ONE_OF_TWO,
+            id="by torchrun",
+            marks=pytest.mark.long,
+        ),
+    ],
+)
+def test_two_processes_learn_what_one_does(dataset, configuration, tmp_path, launcher, start):
     """Half a batch each, gradients averaged: the same steps up to rounding."""
     script = tmp_path / "script.py"
-    script.write_text(
-        "import sys, torch\n"
-        "from pathlib import Path\n"
-        "from rich.progress import Progress\n"
-        "from training.simulation.responses import open_responses\n"
-        "from training.learning.runs import Configuration\n"
-        "from training.learning.train import train\n"
-        "torch.set_num_threads(1)\n"
-        "run = Path(sys.argv[2])\n"
-        "configuration = Configuration.read(run)\n"
-        "train(open_responses(Path(sys.argv[1])), run.parent / 'two', configuration, Progress(disable=True))\n"
-    )
+    script.write_text(TRAINING_OF_ARGUMENTS + start)
     short = dataclasses.replace(configuration, epochs=2)
     train(SimulatedResponses(dataset), tmp_path / "one", short, Progress(disable=True))
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
-        [*command, script, dataset.folder, tmp_path / "one"], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, *launcher, script, dataset.folder, tmp_path / "one"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     one, two = (trained(dataset, tmp_path / name).field.state_dict() for name in ("one", "two"))

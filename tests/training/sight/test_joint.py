@@ -55,6 +55,15 @@ def training(run: Path, dataset: Dataset, views: Views, method: str, recipe: Rec
     return Training(run, dataset, views, method, 3, 0, recipe)
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(dataset, views, tmp_path_factory) -> tuple[Training, Path]:
+    """A joint training that went to its end, and its folder."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    joint = training(folder, dataset, views, "nerf-naf")
+    joint.go_on(untracked)
+    return joint, folder
+
+
 def test_both_losses_move_the_grid_that_both_share(dataset, views, tmp_path: Path) -> None:
     joint = training(tmp_path, dataset, views, "nerf-naf")
     assert joint.learner is not None
@@ -85,10 +94,9 @@ def test_the_penalty_is_a_hundred_thousandth_of_the_sum_of_squares(dataset, view
     assert float(losses["l2"].detach()) == pytest.approx(1e-5 * squares, rel=1e-5)
 
 
-def test_training_brings_the_loss_down_and_the_picture_near(dataset, views, tmp_path: Path) -> None:
-    joint = training(tmp_path, dataset, views, "nerf-naf")
-    joint.go_on(untracked)
-    lines = [line.split(",") for line in (tmp_path / "log.csv").read_text().splitlines()]
+def test_training_brings_the_loss_down_and_the_picture_near(uninterrupted, views) -> None:
+    joint, folder = uninterrupted
+    lines = [line.split(",") for line in (folder / "log.csv").read_text().splitlines()]
     assert lines[0] == ["step", "cpu_s", "colour", "coarse", "naf"]
     first, last = ([float(cell) for cell in line] for line in (lines[1], lines[-1]))
     assert (first[0], last[0]) == (50, 100)
@@ -99,7 +107,9 @@ def test_training_brings_the_loss_down_and_the_picture_near(dataset, views, tmp_
     assert errors < np.mean((128.0 - views.test_pictures) ** 2)
 
 
-def test_an_interrupted_training_ends_as_one_without_interruption(dataset, views, tmp_path: Path, monkeypatch) -> None:
+def test_an_interrupted_training_ends_as_one_without_interruption(
+    uninterrupted, dataset, views, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr("training.sight.joint._CHECKPOINT_S", -1.0)
 
     def broken(steps, _):
@@ -108,9 +118,8 @@ def test_an_interrupted_training_ends_as_one_without_interruption(dataset, views
                 raise InterruptedError
             yield number
 
-    whole, parted = tmp_path / "whole", tmp_path / "parted"
-    uninterrupted = training(whole, dataset, views, "nerf-naf")
-    uninterrupted.go_on(untracked)
+    joint, whole = uninterrupted
+    parted = tmp_path / "parted"
     with pytest.raises(InterruptedError):
         training(parted, dataset, views, "nerf-naf").go_on(broken)
     resumed = training(parted, dataset, views, "nerf-naf")
@@ -118,7 +127,7 @@ def test_an_interrupted_training_ends_as_one_without_interruption(dataset, views
     logs = [[line.split(",")[2:] for line in (run / "log.csv").read_text().splitlines()] for run in (whole, parted)]
     assert logs[0] == logs[1]
     assert len(logs[0]) == 3
-    for one, other in zip(uninterrupted._parts.parameters(), resumed._parts.parameters(), strict=True):
+    for one, other in zip(joint._parts.parameters(), resumed._parts.parameters(), strict=True):
         assert torch.equal(one, other)
 
 
