@@ -9,6 +9,8 @@ import pytest
 
 pytestmark = pytest.mark.untimed
 
+A_SCENE = '[parameters]\n"path.scene" = "flat"\n'
+
 
 def schemathesis(address, folder, *, config, examples):
     """Ends by itself; with a seed, so that what fails fails again."""
@@ -32,7 +34,8 @@ def schemathesis(address, folder, *, config, examples):
     ("config", "examples"),
     [
         pytest.param("", 5, id="any scene, which there is hardly ever", marks=pytest.mark.long),
-        pytest.param('[parameters]\n"path.scene" = "flat"\n', 10, id="a scene there is"),
+        pytest.param(A_SCENE, 10, id="a scene there is, asked more", marks=pytest.mark.long),
+        pytest.param(A_SCENE, 3, id="a scene there is"),
     ],
 )
 def test_the_server_is_as_its_document_says(served, tmp_path, config, examples):

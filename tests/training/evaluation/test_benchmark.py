@@ -72,7 +72,7 @@ def test_every_layout_is_recognised_read_and_scored(tmp_path, layout):
 
 
 @pytest.mark.parametrize("layout", WRITTEN)
-@pytest.mark.parametrize("method", ["nearest", "linear"])
+@pytest.mark.parametrize("method", ["nearest", pytest.param("linear", marks=pytest.mark.long)])
 def test_methods_of_ours_predict_from_the_training_part_of_every_layout(tmp_path, layout, method):
     folder = WRITTEN[layout](tmp_path / "data")
     if layout == "acousticrooms":
@@ -230,8 +230,17 @@ def measured(tmp_path):
     return Room(tail=0.05).write(tmp_path / "measured").folder
 
 
-@pytest.mark.parametrize("suffix", [".wav", ".npy"])
-@pytest.mark.parametrize("method", ["nearest", "linear", "linear-aligned"])
+@pytest.mark.parametrize(
+    ("method", "suffix"),
+    [
+        ("nearest", ".wav"),
+        ("linear-aligned", ".npy"),
+        *(
+            pytest.param(*each, marks=pytest.mark.long)
+            for each in (("nearest", ".npy"), ("linear", ".wav"), ("linear", ".npy"), ("linear-aligned", ".wav"))
+        ),
+    ],
+)
 def test_a_score_is_what_evaluate_says(measured, tmp_path, method, suffix):
     data = open_benchmark(measured)
     write_predictions(data, of_method(method), tmp_path / "predictions", suffix=suffix)

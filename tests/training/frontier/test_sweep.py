@@ -24,7 +24,7 @@ from training.frontier.sweep import Effort, record, sweep, with_levels
 from training.frontier.walk import POSES_PER_S, SPEED_M_PER_S, walk
 
 EFFORT = Effort(pairs=4, yaws=4, walk_s=12.0)
-WITH_A_SHORT_WALK = replace(EFFORT, walk_s=2.0)
+WITH_A_SHORT_WALK = replace(EFFORT, yaws=2, walk_s=2.0)
 """For tests that look at accuracy alone."""
 
 

@@ -133,6 +133,7 @@ def test_smooth_walls_need_no_scattering(box):
     assert rough.change_jnd == pytest.approx(2.05, abs=0.2)
 
 
+@pytest.mark.long
 def test_little_scattering_is_heard_where_many_reflections_follow(box):
     """Of tiles all round, 0.05 of scattering shorten reverberation by 7 to 9 %: 1.4 to 1.8 JND."""
     tiled = with_materials(with_geometry(box, corners=((0, 0), (2, 0), (2, 2.5), (0, 2.5)), height_m=2.4))

@@ -43,7 +43,9 @@ def test_places_of_one_small_room_share_their_late_sound(name):
     assert planner_of(scene, 0).plan({}).tail_start_s is not None
 
 
-@pytest.mark.parametrize(("scene", "most"), [("small1", 20_000), ("own/stairwell", 10_000)])
+@pytest.mark.parametrize(
+    ("scene", "most"), [("small1", 20_000), pytest.param("own/stairwell", 10_000, marks=pytest.mark.long)]
+)
 def test_a_tail_of_a_room_that_mixes_well_needs_few_rays(scene, most):
     scene = SceneFile.read(SCENES / f"{scene}.toml")
     predictions = Predictions(scene, scene.probe_positions(0))

@@ -164,7 +164,10 @@ def test_equipment_that_is_late_is_told_with_the_latency_to_try(imported, tmp_pa
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize(
     ("scale", "told_as"),
-    [(1000, "millimetres? try --position-scale 0.001"), (100, "centimetres? try --position-scale 0.01")],
+    [
+        (1000, "millimetres? try --position-scale 0.001"),
+        pytest.param(100, "centimetres? try --position-scale 0.01", marks=pytest.mark.long),
+    ],
 )
 def test_positions_in_another_unit_are_told_with_the_scale_to_try(imported, tmp_path, layout, scale, told_as):
     code, _, told = imported(layout, scale=scale)
