@@ -19,8 +19,10 @@ _PATIENT = {
     "gcs_rpc_server_reconnect_timeout_s": 300,
 }
 """A node is not lost because the machine is busy; a killed one is noticed by its closed connection."""
-_SLOWNESS = 20.0
+_SLOWNESS = 4.0
 """Ray gives a node 30 s to start, which is not enough on a busy machine: its clock runs so much slower meanwhile."""
+_STARTS = 3
+"""A node that waits more than 15 s for its own agent ends, and there is no setting for it: it is started again."""
 
 
 @contextmanager
@@ -32,7 +34,7 @@ def ray_nodes(*cores: int, environment: Mapping[str, str] = MappingProxyType({})
 
     slow = SimpleNamespace(**{**vars(time), "monotonic": lambda: time.monotonic() / _SLOWNESS})
     options = {"object_store_memory": _STORE_BYTES, "include_dashboard": False}
-    cluster = Cluster(shutdown_at_exit=False)
+    cluster = Cluster()  # its processes end with this one, however it ends
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(node, "time", slow)
@@ -40,8 +42,19 @@ def ray_nodes(*cores: int, environment: Mapping[str, str] = MappingProxyType({})
                 patch.setenv(name, value)
             for number, count in enumerate(cores, start=2):
                 only_first = {"_system_config": _PATIENT} if number == 2 else {}
-                cluster.add_node(num_cpus=count, node_ip_address=f"127.0.0.{number}", **options, **only_first)
+                address = f"127.0.0.{number}"
+                _start(cluster, num_cpus=count, node_ip_address=address, **options, **only_first)
         yield cluster
     finally:
         for each in [*cluster.worker_nodes, *([cluster.head_node] if cluster.head_node else [])]:
             cluster.remove_node(each, allow_graceful=False)
+
+
+def _start(cluster: Any, **options: Any) -> None:
+    for left in reversed(range(_STARTS)):
+        try:
+            cluster.add_node(**options)
+            return
+        except Exception:  # Ray has no narrower one
+            if not left:
+                raise

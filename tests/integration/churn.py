@@ -17,11 +17,21 @@ _SEQUENCE_AT = 4
 
 
 async def visit(address: str, *, blocks: int, emitters: int, scene: str = SCENE, is_aborted: bool = False) -> None:
-    """Hear so many blocks of so many emitters, walking; and leave with a goodbye, or drop the connection."""
+    """Hear so many blocks of so many emitters, walking; and leave with a goodbye, or drop the connection. Whoever is
+    refused comes back when told to."""
+    while (wait_s := await _ask(address, blocks, emitters, scene, is_aborted)) is not None:  # noqa: ASYNC110  seconds told
+        await asyncio.sleep(wait_s)
+
+
+async def _ask(address: str, blocks: int, emitters: int, scene: str, is_aborted: bool) -> int | None:
+    """One visit. Returns after how many seconds to come back, or None if it was let in."""
     hello = Hello(protocol=PROTOCOL, scene=scene, buffer_blocks=2)
     async with connect(f"ws://{address}/v1/stream", compression=None, max_queue=None) as socket:
         await socket.send(hello.serialize())
         welcome = json.loads(await socket.recv())
+        if welcome.get("code") == "server_busy":
+            assert 1 <= welcome["retry_after_s"] <= 60
+            return welcome["retry_after_s"]
         assert welcome["type"] == "welcome", welcome
         for number in range(emitters):
             place = (6.0, 3.0 - 0.3 * number, 1.5)
@@ -40,6 +50,7 @@ async def visit(address: str, *, blocks: int, emitters: int, scene: str = SCENE,
             await socket.send(pose.serialize_binary())
         if is_aborted:
             socket.transport.abort()
+    return None
 
 
 async def churn(address: str, visits: int, *, at_once: int, blocks: int, emitters: int, scene: str = SCENE) -> None:
