@@ -48,7 +48,9 @@ async def serving(application, ws=PROTOCOL, accepts=True, **more):
         await send({"type": "websocket.accept"})
         await application(scope, receive, send)
 
-    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", "log_config": None, **more}
+    # Without a level of its own, it would have that of the last server in this process.
+    logs = {"log_config": None, "log_level": "warning"}
+    options = {"port": 0, "ws": ws, "ws_per_message_deflate": False, "lifespan": "off", **logs, **more}
     asgi = accepted if accepts else application
     server = uvicorn.Server(uvicorn.Config(asgi, **options, timeout_graceful_shutdown=1))
     running = asyncio.create_task(server.serve())
