@@ -46,6 +46,9 @@ class Laborious:
             pass
         return np.tile(self._ir, (len(listeners), 1, 1))
 
+    def first_samples(self, listeners, emitters, heads, samples):
+        return self.impulse_responses(listeners, emitters, heads)[..., :samples].copy()
+
 
 @pytest.fixture
 def served(serving, field, hrtfs):
