@@ -55,6 +55,6 @@ def _start(cluster: Any, **options: Any) -> None:
         try:
             cluster.add_node(**options)
             return
-        except Exception:  # Ray has no narrower one
+        except Exception:  # of a node that ends too soon, Ray raises no narrower one
             if not left:
                 raise

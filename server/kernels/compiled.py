@@ -42,8 +42,8 @@ def compiled_in_place(function: Function) -> Function:
     short loops over many arrays, reference counting is a tenth of all work, and is left out here. A function that
     allocates does not compile.
 
-    Compiled callers contain its code. Calling it would pass some ten numbers for each array, and for a record of forty
-    arrays that takes as long as the work on them."""
+    Compiled callers contain its code in place of a call. A call would pass some ten numbers for each array; with a
+    record of forty arrays, that takes as long as the work on them."""
     return _compile(function, _nrt=False, forceinline=True)
 
 

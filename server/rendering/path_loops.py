@@ -162,28 +162,21 @@ def locate(
     share: FloatArray,
 ) -> None:
     """Compute the arguments with which `read_at` reads sample i at (start + i - delay) modulo `ring`, where the delay
-    is the polynomial with coefficients `a` at i + 1.
-
-    Only what the delay changes within the block is computed in single precision and 32 bits, of which processors
-    compute most values at once.
-    """
-    begin = np.floor(start - a0)
-    offset, origin = np.float32(start - a0 - begin), np.int32(begin)
-    b1, b2, b3 = np.float32(a1), np.float32(a2), np.float32(a3)
-    turn, last = np.int32(ring), np.int32(PHASES - 1)
+    is the polynomial with coefficients `a` at i + 1."""
+    turn, last = float(ring), np.int32(PHASES - 1)
     for i in range(first.size):
-        n = np.int32(i)
-        u = np.float32(n) + np.float32(1)
-        at = offset - u * (b1 + u * (b2 + u * b3))
-        towards_zero = np.int32(at)
-        whole = np.int32(towards_zero - np.int32(at < np.float32(towards_zero)))
-        phase = (at - np.float32(whole)) * np.float32(PHASES)
+        # 32 bits, because processors convert several such numbers at once, and longer ones one by one.
+        n = float(np.int32(i))
+        u = n + 1.0
+        at = start + n - (a0 + u * (a1 + u * (a2 + u * a3)))
+        at += 0.0 if at >= 0.0 else turn
+        whole = np.int32(at)
+        phase = (at - whole) * PHASES
         step = np.int32(phase)
         step = min(last, step)
-        place = np.int32(origin + n + whole)
-        first[i] = place + (turn if place < 0 else np.int32(0))
+        first[i] = whole
         row[i] = step
-        share[i] = phase - np.float32(step)
+        share[i] = phase - step
 
 
 @compiled_in_place

@@ -150,8 +150,6 @@ class Admission:
         self._block_sent_s = limits.block_sent_s
         self._opening_s = 0.0
         self._measured_s, self._measured_cpu_s = time_s(), 0.0
-        self._load: ServerLoad | None = None
-        """The load of now; None after anything has changed. Refusals change nothing, so a rush of them shares it."""
 
     @property
     def streams(self) -> int:
@@ -172,7 +170,6 @@ class Admission:
         if passed_s <= 0:
             return
         self._measured_s, self._measured_cpu_s = now_s, cpu_s
-        self._load = None
         blocks_hz = sum(1 / stream.block_s for stream in self._engine.streams)
         if blocks_hz:
             # The event loop does other work too, so blocks take no more than what it took when it took least.
@@ -193,11 +190,6 @@ class Admission:
 
     def load(self) -> ServerLoad:
         """Return what all streams take, those with a place but not opened yet included."""
-        if self._load is None:
-            self._load = self._load_now()
-        return self._load
-
-    def _load_now(self) -> ServerLoad:
         now_s = self._time_s()
         by_thread = self._engine.streams_by_thread()
         numbers = {thread: number for number, thread in enumerate(self._engine.threads)}
@@ -273,7 +265,6 @@ class Admission:
 
     def open(self, place: Place, stream: Stream) -> None:
         """Note that the stream of a place begins, before the engine opens it."""
-        self._load = None
         place.stream, place.until_s = stream, self._time_s() + self._limits.reserved_s
         self._by_stream[stream] = place
         stream.expected_load = self._expected(place, place.reserved).rendering if place.kind else 0.0
@@ -282,7 +273,6 @@ class Admission:
         """Give a place back. A second call changes nothing."""
         if place not in self._places:
             return
-        self._load = None
         del self._places[place]
         if place.stream is not None:
             del self._by_stream[place.stream]
@@ -297,7 +287,6 @@ class Admission:
         is_reserved = after.emitters <= place.reserved and now_s < place.until_s and after.is_live == place.is_live
         if not is_reserved and (found := self._found(place, after)) is not None:
             return self._refuse("add_emitter", found)
-        self._load = None
         place.emitters, place.is_live = after.emitters, after.is_live
         place.reserved = max(place.reserved, place.emitters)
         self._keep(place, now_s)
@@ -305,7 +294,6 @@ class Admission:
 
     def remove_emitter(self, place: Place) -> None:
         """Note that an emitter of a stream goes."""
-        self._load = None
         place.emitters = max(0, place.emitters - 1)
 
     def choose(self, place: Place, steps: Sequence[QualityStep]) -> int | Refusal:
@@ -332,7 +320,6 @@ class Admission:
     def _count_emitters(self, place: Place) -> None:
         """Once a stream has shown what it takes, it has the emitters that it has."""
         if place.stream is not None and self._time_s() >= place.until_s:
-            self._load = None
             place.emitters = place.reserved = place.stream.session.emitter_count
 
     def _found(self, before: Place, after: Place, *, is_whole: bool = False) -> Scarce | None:
@@ -366,7 +353,6 @@ class Admission:
 
     def _keep(self, place: Place, now_s: float) -> None:
         """Count a stream with its expected cost for some time more."""
-        self._load = None
         place.until_s = max(place.until_s, now_s + self._limits.shown_after_s)
         if place.stream is not None and place.kind is not None:
             place.stream.expected_load = self._expected(place, max(place.emitters, place.reserved)).rendering
@@ -375,7 +361,6 @@ class Admission:
         # Until its stream begins, a place is kept without end.
         place = Place(kind, step, is_top, thread, emitters=0, reserved=reserved, until_s=math.inf)
         self._places[place] = None
-        self._load = None
         if kind is not None:
             self._opening_s += self._expected(place, reserved).opening_s
             if self._is_on:

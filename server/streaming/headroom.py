@@ -215,36 +215,25 @@ class ServerLoad:
 
     def plus(self, thread: int, cost: StreamCost) -> "ServerLoad":
         """Return the load with one more stream on a thread."""
-        return self._with(
-            thread,
-            self.threads[thread].plus(cost),
-            cost,
-            1,
+        return replace(
+            self._with(thread, self.threads[thread].plus(cost), cost, 1),
             patience_s=min(self.patience_s, cost.patience_s) if cost.is_top else self.patience_s,
             opening_s=self.opening_s + cost.opening_s,
         )
 
     def minus(self, thread: int, cost: StreamCost) -> "ServerLoad":
         """Return the load without a stream of a thread; patience and first IRs stay as they are."""
-        without = self.threads[thread].minus(cost)
-        return self._with(thread, without, cost, -1, patience_s=self.patience_s, opening_s=self.opening_s)
+        return self._with(thread, self.threads[thread].minus(cost), cost, -1)
 
-    def _with(
-        self, number: int, thread: ThreadLoad, cost: StreamCost, sign: int, *, patience_s: float, opening_s: float
-    ) -> "ServerLoad":
+    def _with(self, number: int, thread: ThreadLoad, cost: StreamCost, sign: int) -> "ServerLoad":
         top, eased = (cost.demand, 0.0) if cost.is_top else (0.0, cost.demand)
-        # In a rush this is called some thousand times a second, for which `replace` is too slow.
-        return ServerLoad(
+        return replace(
+            self,
             threads=(*self.threads[:number], thread, *self.threads[number + 1 :]),
-            cores=self.cores,
-            workers=self.workers,
             loop=max(0.0, self.loop + sign * cost.loop),
             demand=max(0.0, self.demand + sign * top),
             round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
-            patience_s=patience_s,
             eased_demand=max(0.0, self.eased_demand + sign * eased),
-            opening_s=opening_s,
-            most_streams=self.most_streams,
         )
 
 
