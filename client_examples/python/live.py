@@ -22,7 +22,7 @@ from websockets.exceptions import InvalidStatus, WebSocketException
 
 DRY = struct.Struct("<BBHII")  # kind 3, encoding 0 (f32), bytes of the id, sequence, frames; then id and frames
 WET = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
-PROTOCOL = 2
+PROTOCOL = 3
 BLOCK_SIZE = 256
 EMITTER = "microphone"
 

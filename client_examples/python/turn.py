@@ -27,7 +27,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus, WebSocketException
 
 BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
-PROTOCOL = 2
+PROTOCOL = 3
 BLOCK_SIZE = 256
 SAMPLED = np.random.default_rng(0).standard_normal((64, 3))
 SAMPLED /= np.linalg.norm(SAMPLED, axis=1, keepdims=True)

@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 
 POSE = struct.Struct("<BBHI7f")  # kind 2, two paddings, pose id, position, orientation
 BLOCK = struct.Struct("<BBHIQIII")  # kind 1, flags, channels, sequence, sample clock, pose ids, frames
-PROTOCOL = 2
+PROTOCOL = 3
 POSES_PER_SECOND = 30
 BLOCK_SIZE = 256
 EFFECTS = [

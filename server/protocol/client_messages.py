@@ -1,4 +1,4 @@
-"""Messages from the client in the WebSocket stream at /v1/stream, protocol version 2.
+"""Messages from the client in the WebSocket stream at /v1/stream, protocol version 3.
 
 Control messages are JSON text, one object with a `type` each. Listener poses may also be 36-byte binary messages, and
 audio is always binary blocks (`server.protocol.blocks`). Binary is little endian. Units are metres, radians, decibels
@@ -38,7 +38,7 @@ from server.protocol.codecs.registry import Encoding
 from server.protocol.layout import Layout
 from server.protocol.message import WHOLE, Integer, Message, Position
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 AUTO = "auto"
 """Name of a level in messages; it lets the server choose the quality level."""
 
@@ -99,7 +99,7 @@ class Hello(Message):
     norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn then changes nothing in
     the blocks. `effects` switches effects on or off, whatever the plan would decide. `emitters` is how many emitters
     the client is about to add: the server lets the stream in only if they fit, and keeps room for them for some
-    seconds. Without it the server expects as many as other streams have; servers up to 0.1 refuse it."""
+    seconds. Without it the server expects as many as other streams have."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer

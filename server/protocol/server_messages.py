@@ -25,8 +25,7 @@ class Place(Message):
 class SceneDescription(Message):
     """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
     are unknown. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are the
-    quality levels that know from where sound arrives, so that a stream of them may be ambisonic; servers up to 0.1 do
-    not send them.
+    quality levels that know from where sound arrives, so that a stream of them may be ambisonic.
 
     `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
     scene's fields break, each with the reason why the scene is offered all the same.
@@ -54,11 +53,11 @@ class SceneDescription(Message):
 
 class Welcome(Message):
     """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
-    `level` is the first quality level. `max_emitters` is how many emitters the stream may have at once; servers up to
-    0.1 do not send it. `order` is that of ambisonic channels; streams of other outputs do not have it."""
+    `level` is the first quality level. `max_emitters` is how many emitters the stream may have at once. `order` is that
+    of ambisonic channels; streams of other outputs do not have it."""
 
     type: Literal["welcome"] = "welcome"
-    protocol: Literal[2] = PROTOCOL
+    protocol: Literal[3] = PROTOCOL
     session: str
     scene: SceneDescription
     sample_rate: int

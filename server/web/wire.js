@@ -1,7 +1,7 @@
-// Wire format of /v1/stream, protocol version 2: parsers and serialisers side by side.
+// Wire format of /v1/stream, protocol version 3: parsers and serialisers side by side.
 // Units are metres and radians; everything binary is little endian.
 
-export const PROTOCOL = 2;
+export const PROTOCOL = 3;
 
 const AUDIO_BLOCK = 1;
 const LISTENER_POSE = 2;

@@ -243,7 +243,7 @@ BAD_TEXT = [
         "malformed_directivity",
     ),
     ('{"type": "set_gain", "id": "ghost", "gain_db": 0}', "unknown_emitter"),
-    ('{"type": "hello", "protocol": 2, "scene": "flat"}', "unexpected_hello"),
+    ('{"type": "hello", "protocol": 3, "scene": "flat"}', "unexpected_hello"),
     (json.dumps({"type": "ping", "id": 1, "padding": "x" * 70_000}), "message_too_large"),
     # Few enough characters, too many bytes.
     (json.dumps({"type": "ping", "id": 1, "padding": "é" * 40_000}, ensure_ascii=False), "message_too_large"),
@@ -288,15 +288,15 @@ def test_a_clip_that_cannot_be_decoded_says_why(ears):
     [
         (Ping(id=1).serialize(), "hello_expected"),
         ("?", "malformed_message"),
-        (Hello(protocol=1, scene="flat").serialize(), "unsupported_protocol"),
+        (Hello(protocol=2, scene="flat").serialize(), "unsupported_protocol"),
         (Hello(protocol=PROTOCOL, scene="flat", hrtf="moomin").serialize(), "unknown_hrtf"),
         (Hello(protocol=PROTOCOL, scene="moon").serialize(), "unknown_scene"),
         (Hello(protocol=PROTOCOL, scene="flat", sample_rate=48_000).serialize(), "unsupported_sample_rate"),
         (
-            '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
+            '{"type": "hello", "protocol": 3, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
             "position_out_of_bounds",
         ),
-        ('{"type": "hello", "protocol": 3, "scene": "flat", "spatial": true}', "unsupported_protocol"),
+        ('{"type": "hello", "protocol": 4, "scene": "flat", "spatial": true}', "unsupported_protocol"),
         (b"", "hello_expected"),
         (ListenerPose(pose_id=1, position=(2.0, 2.0, 1.5)).serialize_binary(), "hello_expected"),
         (b"\xff" * 40, "hello_expected"),

@@ -15,8 +15,8 @@ from server.scene.bundle import BUNDLED, MANIFEST_FILE, Bundle
 from server.scene.manifest import ARRAYS_FILE
 
 MESSAGES = [
-    '{"type": "hello", "protocol": 2, "scene": "flat", "block_size": 256, "encoding": "s16", "buffer_blocks": 8}',
-    '{"type": "hello", "protocol": 2, "scene": "flat", "listener": {"position": [1, 2, 1.5], "yaw": 0.5}}',
+    '{"type": "hello", "protocol": 3, "scene": "flat", "block_size": 256, "encoding": "s16", "buffer_blocks": 8}',
+    '{"type": "hello", "protocol": 3, "scene": "flat", "listener": {"position": [1, 2, 1.5], "yaw": 0.5}}',
     '{"type": "add_emitter", "id": "a", "clip": "noise", "position": [6, 3, 1.5], "gain_db": -6.0, "loop": true}',
     '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "orientation": [0, 0, 0, 1],'
     ' "directivity": {"pattern": "cardioid", "order": 2.5}}',

@@ -241,7 +241,7 @@ def test_levels_of_ears_are_not_offered_to_a_stream_of_ambisonics(field, field_a
 )
 def test_an_impossible_order_is_refused_by_its_name(given, field_at_fault):
     with pytest.raises(RequestError) as refused:
-        parse_client_message(f'{{"type": "hello", "protocol": 2, "scene": "flat", {given}}}')
+        parse_client_message(f'{{"type": "hello", "protocol": 3, "scene": "flat", {given}}}')
     assert (refused.value.code, refused.value.field) == ("malformed_message", field_at_fault)
 
 
@@ -249,7 +249,7 @@ def test_an_impossible_order_is_refused_by_its_name(given, field_at_fault):
     ("given", "order"), [("", 1), (', "order": 3', 3), (', "order": 2.0', 2), (', "order": null', 1)]
 )
 def test_the_usual_order_is_the_first(given, order):
-    text = f'{{"type": "hello", "protocol": 2, "scene": "flat", "output": "ambisonics"{given}}}'
+    text = f'{{"type": "hello", "protocol": 3, "scene": "flat", "output": "ambisonics"{given}}}'
     assert parse_client_message(text).ambisonic_order == order
 
 

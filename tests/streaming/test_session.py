@@ -262,8 +262,8 @@ def test_emitters_are_limited(field, filters):
 @pytest.mark.parametrize(
     ("changes", "code"),
     [
-        ({"protocol": 1}, "unsupported_protocol"),
-        ({"protocol": 3}, "unsupported_protocol"),
+        ({"protocol": 2}, "unsupported_protocol"),
+        ({"protocol": 4}, "unsupported_protocol"),
         ({"sample_rate": 44_100}, "unsupported_sample_rate"),
         ({"listener": ListenerStart(position=(-5.0, 0.0, 0.0))}, "position_out_of_bounds"),
     ],
