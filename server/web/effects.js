@@ -57,6 +57,17 @@ export class Effects extends EventTarget {
     this.rest();
   }
 
+  /** Takes what was switched before, and the output, without an event. */
+  restore({ effects, output }) {
+    this.#wishes = { ...effects };
+    if (output !== undefined && [...this.#output.options].some(({ value }) => value === output)) this.#output.value = output;
+  }
+
+  /** Switches effects on, off, or to what the plan says (null), as if by hand. */
+  wish(effects) {
+    this.#wish(effects);
+  }
+
   /** Effects for a hello: only those that the user switched. */
   get wishes() {
     return { effects: { ...this.#wishes }, output: this.#output.value };

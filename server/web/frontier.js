@@ -35,6 +35,7 @@ export class Frontier extends EventTarget {
   #changes;
   #levels = [];
   #heard = null;
+  #wish = null; // a level that was chosen before the levels were known
   #history = []; // {at, level, text}, newest first
 
   /** `root` is the section. Emits "chosen" with a level's name or "auto". */
@@ -51,11 +52,18 @@ export class Frontier extends EventTarget {
 
   /** Name of the chosen level, or "auto". */
   get chosen() {
-    return this.#choice.value || "auto";
+    return this.#wish ?? (this.#choice.value || "auto");
+  }
+
+  /** Chooses a level without an event. */
+  set chosen(name) {
+    if (this.#levels.length === 0) this.#wish = name;
+    else this.#choice.value = name;
   }
 
   show({ levels }) {
-    const chosen = this.chosen || "auto";
+    const { chosen } = this;
+    this.#wish = null;
     this.#levels = levels;
     const options = levels.filter(({ is_offered: isOffered }) => isOffered).reverse().map((level) => {
       const cost = hereOf(level) ?? level.ms_mean;
@@ -100,6 +108,7 @@ export class Frontier extends EventTarget {
   }
 
   #choose(name = this.#choice.value) {
+    this.#wish = null;
     this.#choice.value = name;
     this.dispatchEvent(new CustomEvent("chosen", { detail: name }));
   }

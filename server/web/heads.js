@@ -6,6 +6,7 @@ const titleOf = (name) => TITLES[name] ?? name;
 export class Heads extends EventTarget {
   #choice;
   #isKnown = false;
+  #wish = null; // a head that is taken if the server offers it
   #isUsed = true;
 
   /** `choice` is the menu. */
@@ -20,9 +21,15 @@ export class Heads extends EventTarget {
     return this.#isKnown ? this.#choice.value : undefined;
   }
 
+  /** Takes this head as soon as the server turns out to offer it. */
+  set wish(name) {
+    this.#wish = name;
+  }
+
   /** Offers these heads. The present choice stays if it is among them. */
   show({ default: usual, hrtfs }) {
-    const before = this.chosen;
+    const before = this.#wish ?? this.chosen;
+    this.#wish = null;
     const options = hrtfs.map((name) => {
       const option = new Option(titleOf(name), name);
       option.title = name;

@@ -1,6 +1,7 @@
 // Connects the parts of the page: scene and loudness over HTTP, poses and audio through the stream worker, the floor plan, the panels
 // and the keyboard.
 
+import { Comparison } from "./comparison.js";
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
@@ -13,13 +14,17 @@ import { exposeHook } from "./hook.js";
 import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
+import { PhoneTurning } from "./phone.js";
 import { Player } from "./player.js";
 import { fetchClips, fetchDecoder, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { linkTo, readSituation } from "./situation.js";
 import { Sources } from "./sources.js";
 import { Turning } from "./turning.js";
 import { Walking } from "./walking.js";
 import { World } from "./world.js";
 
+const DRY = { early_reflections: false, late_reverberation: false };
+const AS_PLANNED = { early_reflections: null, late_reverberation: null };
 const ORDER = 1; // of ambisonic streams
 const NO_FIELD = "none";
 const REST_MS = 1000; // the turn of a head at rest is measured this often
@@ -37,9 +42,12 @@ class Page {
     this.panel = new Panel(document);
     this.legend = new Legend(find("legend"));
     this.frontier = new Frontier(find("quality"));
+    this.comparison = new Comparison(find("compare"));
+    this.isDry = false; // whether a comparison has switched all but the direct sound off
     this.effects = new Effects(find("rendered"));
     this.heads = new Heads(find("head"));
     this.turning = new Turning(find("turning"));
+    this.phone = new PhoneTurning(find("phone"));
     this.output = null; // of the present stream; null while there is none
     this.rendered = null; // the server's plan of effects; null while there is no stream
     this.level = this.head = null; // the present level and head; null while there is no stream
@@ -81,7 +89,7 @@ class Page {
       if (this.turning.isHere) this.#listenWithHead(); // a server may take a second to make the filters
     });
     if (clips.length === 0) this.#fill("clips", fetchClips, (found) => this.#gotClips(found));
-    this.#fill("frontier", () => fetchFrontier(scene.id), (frontier) => this.frontier.show(frontier));
+    this.#fill("frontier", () => fetchFrontier(scene.id), (frontier) => this.#showLevels(frontier));
     this.#setConnection("idle", "Ready");
   }
 
@@ -148,8 +156,8 @@ class Page {
     if (scene.levels.every(({ field }) => field === NO_FIELD)) this.turning.usual = "server";
     this.panel.turnsHere = this.turning.isHere;
     this.#turnHead();
-    if (clips.length > 0) this.world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
-    else this.notices.show("clips", "The server has no clip to play.", { lasting: true });
+    this.#restore(readSituation(location.hash));
+    if (clips.length === 0) this.notices.show("clips", "The server has no clip to play.", { lasting: true });
     this.paper = new Paper(find("paper"), scene);
     this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
     this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source"), limit: find("source-limit") });
@@ -223,7 +231,7 @@ class Page {
         this.notices.show(code, message);
         // A restarted server may offer other scenes, clips and heads.
         if (code === "unknown_hrtf") fetchHeads().then((heads) => this.heads.show(heads), () => {});
-        if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
+        if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.#showLevels(frontier), () => {});
       },
     };
     this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
@@ -233,9 +241,21 @@ class Page {
   #listenToControls() {
     find("play").addEventListener("click", () => (this.playing ? this.pause() : this.play()));
     this.frontier.addEventListener("chosen", ({ detail }) => {
-      this.turning.level = detail;
-      if (!this.#renewed({ level: detail })) this.#tell("level", { name: detail });
+      this.comparison.leave();
+      this.#useLevel(detail);
     });
+    this.comparison.addEventListener("heard", ({ detail: { level, isDry } }) => {
+      if (level !== null) {
+        this.frontier.chosen = level;
+        this.#useLevel(level);
+      }
+      this.#useDry(isDry);
+    });
+    this.comparison.addEventListener("left", () => this.#useDry(false));
+    this.phone.addEventListener("turned", ({ detail }) => this.world.moveListener(null, this.world.listener.yaw + detail));
+    this.phone.addEventListener("denied", () => this.notices.show("phone", "The browser does not tell the page how the phone is turned."));
+    find("share").addEventListener("click", () => this.#share());
+    window.addEventListener("hashchange", () => location.reload()); // another situation was opened
     this.effects.addEventListener("wished", ({ detail }) => {
       this.heads.used = this.turning.used = this.effects.wishes.output !== "mono";
       if (!this.#renewed()) {
@@ -260,6 +280,67 @@ class Page {
   #setVolume(percent) {
     find("volume").style.setProperty("--value", `${percent}%`);
     this.player.volume = (percent / 100) ** 2; // closer to perceived loudness than a linear control
+  }
+
+  #showLevels(frontier) {
+    this.frontier.show(frontier);
+    this.comparison.show(frontier.levels.filter(({ is_offered: isOffered }) => isOffered).reverse());
+  }
+
+  #useLevel(name) {
+    this.turning.level = name;
+    if (!this.#renewed({ level: name })) this.#tell("level", { name });
+  }
+
+  #useDry(isDry) {
+    if (isDry === this.isDry) return;
+    this.isDry = isDry;
+    this.effects.wish(isDry ? DRY : AS_PLANNED);
+  }
+
+  /** Takes over what a link says, and gives the scene its first source if the link has none. */
+  #restore(shared) {
+    const { world, scene, clips } = this;
+    if (shared?.listener) world.moveListener(shared.listener.position, shared.listener.yaw);
+    const missing = new Set();
+    for (const source of shared?.sources ?? []) {
+      if (!clips.some(({ name }) => name === source.clip)) missing.add(source.clip);
+      else if (!world.isFull) {
+        const { id } = world.addEmitter({ ...source, position: scene.emitter.position });
+        world.moveEmitter(id, source.position);
+      }
+    }
+    if (missing.size > 0) this.notices.show("situation", `This server has no clip ${[...missing].map((name) => `“${name}”`).join(", ")}.`);
+    if (world.emitters.size === 0 && clips.length > 0) world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
+    if (!shared) return;
+    if (scene.levels.some(({ name }) => name === shared.level)) this.frontier.chosen = shared.level;
+    this.heads.wish = shared.head ?? null;
+    this.effects.restore(shared);
+    this.heads.used = this.turning.used = this.effects.wishes.output !== "mono";
+    this.turning.chosen = shared.turning;
+    this.turning.level = this.frontier.chosen;
+  }
+
+  async #share() {
+    const { effects, output } = this.effects.wishes;
+    const level = this.frontier.chosen;
+    const link = linkTo(location.href, {
+      scene: this.scene.id,
+      listener: this.world.listener,
+      sources: [...this.world.emitters.values()],
+      level: level === "auto" ? undefined : level,
+      output: output === "headphones" ? undefined : output,
+      head: this.heads.chosen,
+      turning: this.turning.chosen,
+      effects,
+    });
+    history.replaceState(null, "", link);
+    try {
+      await navigator.clipboard.writeText(link);
+      this.notices.show("share", "The link to what you hear is copied.");
+    } catch {
+      this.notices.show("share", "The address of this page is now the link to what you hear.");
+    }
   }
 
   #listenerNow() {
@@ -399,7 +480,7 @@ class Page {
       this.panel.turnsHere = this.output === "ambisonics";
       this.world.mostEmitters = welcome.max_emitters;
       // If the page was opened while the server warmed up, it does not have the levels' costs yet.
-      fetchFrontier(this.scene.id).then((frontier) => this.frontier.show(frontier), () => {});
+      fetchFrontier(this.scene.id).then((frontier) => this.#showLevels(frontier), () => {});
       this.notices.clear("connection");
     } else if (state === "waiting") {
       this.steady = false;

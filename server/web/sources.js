@@ -2,9 +2,9 @@
 
 import { isVisible } from "./geometry.js";
 import { sourceColour } from "./palette.js";
+import { GAIN_DB } from "./world.js";
 
 const AHEAD = Math.PI / 12;
-const GAIN_DB = { min: -24, max: 12 };
 
 function describe({ distanceM, bearing }, visible) {
   const degrees = Math.round((Math.abs(bearing) * 180) / Math.PI);

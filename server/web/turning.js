@@ -30,6 +30,19 @@ export class Turning extends EventTarget {
     return this.#choice.value === "browser" && this.#isUsed;
   }
 
+  /** What was chosen: "browser" or "server"; undefined if nothing was. */
+  get chosen() {
+    return this.#isChosen ? this.#wish : undefined;
+  }
+
+  /** Chooses as if by the menu. Anything but "browser" and "server" is ignored. */
+  set chosen(where) {
+    if (!["browser", "server"].includes(where)) return;
+    this.#wish = where;
+    this.#isChosen = true;
+    this.#show();
+  }
+
   /** Where sound is turned until someone chooses: "browser" or "server". */
   set usual(where) {
     if (!this.#isChosen) this.#wish = where;

@@ -93,7 +93,7 @@ export class Walking {
 }
 
 /** Whether the focused control uses this key itself. */
-function takesKey({ target, code }) {
+export function takesKey({ target, code }) {
   if (!(target instanceof Element)) return false;
   if (target.closest("select, textarea, [contenteditable]")) return true;
   const input = target.closest("input");

@@ -4,6 +4,8 @@
 
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
+export const GAIN_DB = { min: -24, max: 12 }; // of an emitter
+
 const INSIDE_M = 1e-4;
 const LETTERS = [..."ABCDEFGHIJKLMNOPQRSTUVWXYZ"];
 const IDS = [...LETTERS, ...LETTERS.flatMap((first) => LETTERS.map((second) => first + second))];
@@ -78,10 +80,10 @@ export class World extends EventTarget {
   }
 
   /** Adds an emitter named by the first free letter, at `position` or where there is most room. */
-  addEmitter({ clip, position }) {
+  addEmitter({ clip, position, gainDb = 0 }) {
     const id = IDS.find((each) => !this.emitters.has(each));
     const height = this.scene.emitter.position[2];
-    const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height], gainDb: 0 };
+    const emitter = { id, clip, position: position ? [...position] : [...this.#roomiest(), height], gainDb };
     this.emitters.set(id, emitter);
     this.#emit("emitters");
     return emitter;

@@ -7,6 +7,7 @@ import contextlib
 import re
 
 import pytest
+from axe_playwright_python.base import AXE_FILE_PATH
 
 from tests import visitor
 from tests.visitor import open_page, start
@@ -131,6 +132,30 @@ def test_every_text_stands_out_from_what_is_behind_it(browser, server, scheme):
     count, faint = faint_texts(page)
     assert count > 60
     assert faint == {}
+    context.close()
+
+
+AXE = """async () => {
+  const tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"];
+  const { violations, passes } = await axe.run(document, { runOnly: { type: "tag", values: tags } });
+  const described = violations.map(({ id, help, nodes }) => [id, help, nodes.map(({ html }) => html)]);
+  return { passed: passes.length, violations: described };
+}"""
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_axe_finds_nothing_against_wcag_2_2_level_aa(browser, server, width, scheme):
+    context = browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    page = open_page(context, server)
+    page.click("#add-source")
+    start(page)
+    page.wait_for_function("nafir.state().effects !== null && !document.getElementById('compare-switch').disabled")
+    page.click("#compare-switch")
+    page.click("#share")
+    page.evaluate(AXE_FILE_PATH.read_text(encoding="utf-8"))
+    found = page.evaluate(AXE)
+    assert found["passed"] > 15
+    assert found["violations"] == []
     context.close()
 
 
