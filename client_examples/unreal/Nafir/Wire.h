@@ -1,0 +1,197 @@
+// Messages of /v1/stream, protocol 3: binary ones are little endian, text ones are JSON. C++17, no types of Unreal, no exceptions.
+#pragma once
+
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "Pose.h"
+
+namespace nafir {
+
+inline constexpr int kProtocol = 3;
+
+enum class Encoding : std::uint8_t { kFloat32 = 0, kInt16 = 1 };
+
+inline const char* NameOf(Encoding encoding) { return encoding == Encoding::kFloat32 ? "f32" : "s16"; }
+
+// A block of rendered audio. `samples` are interleaved: left, right, or the channels of ambisonics.
+struct AudioBlock {
+  std::uint32_t sequence = 0;
+  std::uint64_t sample_clock = 0;
+  std::uint32_t pose_id = 0;
+  std::uint32_t reverberation_pose_id = 0;
+  std::uint8_t flags = 0;
+  std::uint16_t channels = 0;
+  std::vector<float> samples;
+};
+
+namespace wire {
+
+inline constexpr std::uint8_t kAudioBlock = 1, kListener = 2, kDryBlock = 3;
+inline constexpr std::size_t kAudioHeaderBytes = 28, kListenerBytes = 36;
+inline constexpr float kFullScale = 32767;
+
+template <typename Number>
+Number Read(const std::uint8_t* data) {
+  // By shifts, so that the order of bytes is the protocol's on every processor.
+  std::uint64_t bits = 0;
+  for (std::size_t i = 0; i < sizeof(Number); ++i) bits |= std::uint64_t{data[i]} << (8 * i);
+  return static_cast<Number>(bits);
+}
+
+inline float ReadFloat(const std::uint8_t* data) {
+  const auto bits = Read<std::uint32_t>(data);
+  float value;
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+template <typename Number>
+void Write(std::uint8_t* data, Number value) {
+  for (std::size_t i = 0; i < sizeof(Number); ++i) data[i] = static_cast<std::uint8_t>(std::uint64_t{value} >> (8 * i));
+}
+
+inline void WriteFloat(std::uint8_t* data, float value) {
+  std::uint32_t bits;
+  std::memcpy(&bits, &value, sizeof bits);
+  Write(data, bits);
+}
+
+inline std::size_t BytesPerSample(Encoding encoding) { return encoding == Encoding::kFloat32 ? 4 : 2; }
+
+inline std::string Quoted(std::string_view text) {
+  std::string quoted = "\"";
+  for (const char each : text) {
+    if (each == '"' || each == '\\') {
+      quoted += '\\';
+      quoted += each;
+    } else if (static_cast<unsigned char>(each) < 0x20) {
+      char escaped[8];
+      std::snprintf(escaped, sizeof escaped, "\\u%04x", each);
+      quoted += escaped;
+    } else {
+      quoted += each;
+    }
+  }
+  return quoted + '"';
+}
+
+// Enough digits for a float, and a point whatever the locale.
+inline std::string Number(double value) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%.9g", value);
+  std::string number = text;
+  for (char& each : number) {
+    if (each == ',') each = '.';
+  }
+  return number;
+}
+
+inline std::string Numbers(const Pose& pose) {
+  const auto& [p, q] = pose;
+  return "\"position\":[" + Number(p.x) + "," + Number(p.y) + "," + Number(p.z) + "],\"orientation\":[" + Number(q.x) + "," + Number(q.y) +
+         "," + Number(q.z) + "," + Number(q.w) + "]";
+}
+
+}  // namespace wire
+
+// The block that a binary message holds; none if it holds another kind, which a client ignores, or is damaged.
+inline std::optional<AudioBlock> ParseAudioBlock(const std::uint8_t* data, std::size_t size, Encoding encoding) {
+  if (size < wire::kAudioHeaderBytes || data[0] != wire::kAudioBlock) return std::nullopt;
+  AudioBlock block;
+  block.flags = data[1];
+  block.channels = wire::Read<std::uint16_t>(data + 2);
+  block.sequence = wire::Read<std::uint32_t>(data + 4);
+  block.sample_clock = wire::Read<std::uint64_t>(data + 8);
+  block.pose_id = wire::Read<std::uint32_t>(data + 16);
+  block.reverberation_pose_id = wire::Read<std::uint32_t>(data + 20);
+  const std::uint64_t frames = wire::Read<std::uint32_t>(data + 24);
+  const std::size_t each = wire::BytesPerSample(encoding);
+  if (block.channels == 0 || size - wire::kAudioHeaderBytes != frames * block.channels * each) return std::nullopt;
+  block.samples.resize(frames * block.channels);
+  for (std::size_t i = 0; i < block.samples.size(); ++i) {
+    const std::uint8_t* at = data + wire::kAudioHeaderBytes + each * i;
+    block.samples[i] = encoding == Encoding::kFloat32 ? wire::ReadFloat(at) : static_cast<std::int16_t>(wire::Read<std::uint16_t>(at)) / wire::kFullScale;
+  }
+  return block;
+}
+
+// The listener's pose. `pose_id` rises over all poses of the stream, the listener's and the emitters'.
+inline std::array<std::uint8_t, wire::kListenerBytes> SerializeListener(std::uint32_t pose_id, const Pose& pose) {
+  std::array<std::uint8_t, wire::kListenerBytes> data{};
+  data[0] = wire::kListener;
+  wire::Write(data.data() + 4, pose_id);
+  const auto& [p, q] = pose;
+  const double numbers[] = {p.x, p.y, p.z, q.x, q.y, q.z, q.w};
+  for (std::size_t i = 0; i < 7; ++i) wire::WriteFloat(data.data() + 8 + 4 * i, static_cast<float>(numbers[i]));
+  return data;
+}
+
+// The next mono samples of a live emitter. `sequence` rises from block to block; an id has at most 64 characters.
+inline std::vector<std::uint8_t> SerializeDryBlock(std::string_view id, std::uint32_t sequence, const float* samples, std::size_t frames, Encoding encoding) {
+  const std::size_t padded = (id.size() + 3) / 4 * 4;
+  const std::size_t each = wire::BytesPerSample(encoding);
+  std::vector<std::uint8_t> data(12 + padded + each * frames);
+  data[0] = wire::kDryBlock;
+  data[1] = static_cast<std::uint8_t>(encoding);
+  wire::Write(data.data() + 2, static_cast<std::uint16_t>(id.size()));
+  wire::Write(data.data() + 4, sequence);
+  wire::Write(data.data() + 8, static_cast<std::uint32_t>(frames));
+  std::memcpy(data.data() + 12, id.data(), id.size());
+  for (std::size_t i = 0; i < frames; ++i) {
+    std::uint8_t* at = data.data() + 12 + padded + each * i;
+    if (encoding == Encoding::kFloat32) {
+      wire::WriteFloat(at, samples[i]);
+    } else {
+      const float clipped = samples[i] < -1 ? -1 : samples[i] > 1 ? 1 : samples[i];
+      wire::Write(at, static_cast<std::uint16_t>(static_cast<std::int16_t>(std::lround(clipped * wire::kFullScale))));
+    }
+  }
+  return data;
+}
+
+namespace message {
+
+// The first message. A `sample_rate` of 0 takes the scene's own.
+inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener) {
+  std::string text = "{\"type\":\"hello\",\"protocol\":" + std::to_string(kProtocol) + ",\"scene\":" + wire::Quoted(scene) +
+                     ",\"block_size\":" + std::to_string(block_size) + ",\"encoding\":\"" + NameOf(encoding) +
+                     "\",\"buffer_blocks\":" + std::to_string(buffer_blocks) + ",\"listener\":{" + wire::Numbers(listener) + "}";
+  if (sample_rate > 0) text += ",\"sample_rate\":" + std::to_string(sample_rate);
+  return text + "}";
+}
+
+// An emitter that plays a clip of the server.
+inline std::string AddClip(std::string_view id, std::string_view clip, const Pose& pose, double gain_db = 0, bool loop = true) {
+  return "{\"type\":\"add_emitter\",\"id\":" + wire::Quoted(id) + ",\"clip\":" + wire::Quoted(clip) + "," + wire::Numbers(pose) +
+         ",\"gain_db\":" + wire::Number(gain_db) + ",\"loop\":" + (loop ? "true" : "false") + "}";
+}
+
+// An emitter that plays the dry blocks that the client sends for it.
+inline std::string AddLive(std::string_view id, const Pose& pose, double gain_db = 0) {
+  return "{\"type\":\"add_emitter\",\"id\":" + wire::Quoted(id) + ",\"live\":true," + wire::Numbers(pose) + ",\"gain_db\":" + wire::Number(gain_db) + "}";
+}
+
+inline std::string MoveEmitter(std::string_view id, std::uint32_t pose_id, const Pose& pose) {
+  return "{\"type\":\"move_emitter\",\"id\":" + wire::Quoted(id) + ",\"pose_id\":" + std::to_string(pose_id) + "," + wire::Numbers(pose) + "}";
+}
+
+inline std::string SetGain(std::string_view id, double gain_db) {
+  return "{\"type\":\"set_gain\",\"id\":" + wire::Quoted(id) + ",\"gain_db\":" + wire::Number(gain_db) + "}";
+}
+
+inline std::string RemoveEmitter(std::string_view id) { return "{\"type\":\"remove_emitter\",\"id\":" + wire::Quoted(id) + "}"; }
+
+// Every block up to `sequence` has arrived. Without it the server soon stops sending.
+inline std::string Acknowledge(std::uint32_t sequence) { return "{\"type\":\"acknowledge\",\"sequence\":" + std::to_string(sequence) + "}"; }
+
+}  // namespace message
+
+}  // namespace nafir

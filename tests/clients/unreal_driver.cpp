@@ -1,0 +1,129 @@
+// Drives client_examples/unreal/Nafir for test_unreal.py: a command a line on standard input, an answer a line on standard output.
+
+#include <cmath>
+#include <cstdio>
+#include <iostream>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "Playback.h"
+#include "Pose.h"
+#include "Wire.h"
+
+namespace {
+
+template <typename Bytes>
+std::string Hex(const Bytes& bytes) {
+  std::string text;
+  for (const std::uint8_t each : bytes) {
+    char digits[3];
+    std::snprintf(digits, sizeof digits, "%02x", each);
+    text += digits;
+  }
+  return text;
+}
+
+std::vector<std::uint8_t> FromHex(const std::string& text) {
+  std::vector<std::uint8_t> bytes;
+  for (std::size_t i = 0; i + 1 < text.size(); i += 2) bytes.push_back(static_cast<std::uint8_t>(std::stoi(text.substr(i, 2), nullptr, 16)));
+  return bytes;
+}
+
+nafir::Encoding EncodingOf(const std::string& name) { return name == "f32" ? nafir::Encoding::kFloat32 : nafir::Encoding::kInt16; }
+
+nafir::Pose ReadPose(std::istream& in) {
+  nafir::Pose pose;
+  in >> pose.position.x >> pose.position.y >> pose.position.z;
+  in >> pose.orientation.x >> pose.orientation.y >> pose.orientation.z >> pose.orientation.w;
+  return pose;
+}
+
+void Print(const nafir::Pose& pose) {
+  const auto& [p, q] = pose;
+  std::cout << p.x << ' ' << p.y << ' ' << p.z << ' ' << q.x << ' ' << q.y << ' ' << q.z << ' ' << q.w;
+}
+
+// A tone through the buffer: a sender's clock `skew` faster than the sound card's, which reads 512 frames at a time; blocks between
+// `from_s` and `to_s` are held up until `to_s`. Answers with the underruns and the second channel.
+void Play(std::istream& in) {
+  double stream_rate, output_rate, skew, hertz, seconds, from_s, to_s;
+  in >> stream_rate >> output_rate >> skew >> hertz >> seconds >> from_s >> to_s;
+  nafir::Playback playback(2, stream_rate, output_rate);
+  std::vector<float> block(2 * 256), output(2 * 512);
+  std::size_t sent = 0;
+  std::string heard;
+  for (double now_s = 0; now_s < seconds; now_s += 512 / output_rate) {
+    for (;;) {
+      double due_s = static_cast<double>(sent + 256) / stream_rate / (1 + skew);
+      if (due_s >= from_s && due_s < to_s) due_s = to_s;
+      if (due_s > now_s) break;
+      for (std::size_t i = 0; i < 256; ++i) {
+        block[2 * i] = 0;
+        block[2 * i + 1] = static_cast<float>(0.5 * std::sin(2 * M_PI * hertz * static_cast<double>(sent + i) / stream_rate));
+      }
+      if (!playback.Push(block.data(), 256)) std::cerr << "no room\n";
+      sent += 256;
+    }
+    playback.Read(output.data(), 512);
+    for (std::size_t i = 0; i < 512; ++i) {
+      heard += std::to_string(output[2 * i + 1]);
+      heard += ' ';
+    }
+  }
+  std::cout << playback.underruns() << ' ' << heard << '\n';
+}
+
+}  // namespace
+
+int main() {
+  std::cout.precision(12);
+  for (std::string line; std::getline(std::cin, line);) {
+    std::istringstream in(line);
+    std::string command, encoding, text;
+    in >> command;
+    if (command == "pose") {
+      const nafir::Pose unreal = ReadPose(in);
+      const nafir::Pose pose = nafir::FromUnreal(unreal.position, unreal.orientation);
+      Print(pose);
+      std::cout << ' ';
+      Print({nafir::PositionToUnreal(pose.position), nafir::OrientationToUnreal(pose.orientation)});
+      std::cout << '\n';
+    } else if (command == "listener") {
+      std::uint32_t pose_id;
+      in >> pose_id;
+      std::cout << Hex(nafir::SerializeListener(pose_id, ReadPose(in))) << '\n';
+    } else if (command == "dry") {
+      std::uint32_t sequence;
+      in >> encoding >> text >> sequence;
+      std::vector<float> samples;
+      for (float each; in >> each;) samples.push_back(each);
+      std::cout << Hex(nafir::SerializeDryBlock(text, sequence, samples.data(), samples.size(), EncodingOf(encoding))) << '\n';
+    } else if (command == "block") {
+      in >> encoding >> text;
+      const auto bytes = FromHex(text);
+      const auto block = nafir::ParseAudioBlock(bytes.data(), bytes.size(), EncodingOf(encoding));
+      if (!block) {
+        std::cout << "none\n";
+        continue;
+      }
+      std::cout << block->sequence << ' ' << block->sample_clock << ' ' << block->pose_id << ' ' << block->reverberation_pose_id << ' '
+                << int{block->flags} << ' ' << block->channels;
+      for (const float each : block->samples) std::cout << ' ' << each;
+      std::cout << '\n';
+    } else if (command == "texts") {
+      const nafir::Pose pose{{1.5, -2.25, 0.1}, {0, 0, 0.6, 0.8}};
+      std::cout << nafir::message::Hello("flat \"1\"", 24000, 256, nafir::Encoding::kInt16, 4, pose) << '\n'
+                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kFloat32, 8, pose) << '\n'
+                << nafir::message::AddClip("a\\b\n", "trumpet", pose, -3.5, false) << '\n'
+                << nafir::message::AddLive("npc-ä", pose) << '\n'
+                << nafir::message::MoveEmitter("x", 4294967295U, pose) << '\n'
+                << nafir::message::SetGain("x", -6) << '\n'
+                << nafir::message::RemoveEmitter("x") << '\n'
+                << nafir::message::Acknowledge(4294967295U) << '\n';
+    } else if (command == "play") {
+      Play(in);
+    }
+    std::cout.flush();
+  }
+}
