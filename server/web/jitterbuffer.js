@@ -12,13 +12,19 @@ const SOON_S = 2; // a much too long buffer, as after a burst that follows a dro
 const MUCH_S = 0.025;
 const AGAIN_S = 0.2; // time from a splice that did not suffice to the next one
 const JUMP_S = 0.15; // if the fill is this far above the headroom, as after a burst, half of it is skipped at once
-const HEADROOM_S = 0.05; // target of the lowest fill on a quiet network
+const HEADROOM_S = 0.05; // target of the lowest fill until the jitter is known
+const LEAST = 2 * QUANTUM + RESERVE; // samples: with less, a block that is one quantum late may be a dropout
+const MARGIN_S = 0.004; // target of the lowest fill above that, without any jitter
+const SHARE_OF_JITTER = 0.75; // added to it: how much deeper than ever before a dip may be without a dropout
+const FALL_S = 0.004; // the headroom shrinks by at most so much in a window
+const FORGETTING = 0.995; // of the jitter, in each window: half in over two minutes
 const START_S = 0.05; // additional headroom at first, while page, server and sound card are busy with starting
 const STARTING = 3; // windows with the additional headroom
 const RIPPLE_S = 0.015; // variation of the fill between the arrival of one block and the next
 const MAX_HEADROOM_S = 0.25;
-const SLACK_S = 0.012; // the buffer is shortened only if the fill is this far above the headroom
-const GROWTH_S = 0.015; // each dropout increases the headroom by this much
+const SLACK_S = 0.006; // the buffer is shortened only if the fill is this far above the headroom
+const GROWTH_S = 0.015; // each dropout increases the headroom by this much, some of which is given back in each window
+const GIVEN_BACK_S = 0.0002;
 const SHORTEST_LAG = 48;
 const LONGEST_LAG = 288;
 const INAUDIBLE = 1e-4; // sum of squares over a quantum of the first two channels, 60 dB below full scale
@@ -44,6 +50,8 @@ export class JitterBuffer {
     this.playing = false;
     this.started = false;
     this.headroomS = HEADROOM_S + START_S;
+    this.jitterS = 0; // how far the fill falls below its mean: the most in a window, slowly forgotten
+    this.grownS = 0; // by dropouts
     this.starting = STARTING;
     this.isShortening = false;
     this.nextClock = null;
@@ -64,6 +72,7 @@ export class JitterBuffer {
 
   #openWindow(seconds = WINDOW_S) {
     this.lowest = Infinity;
+    this.sum = this.count = 0; // of the fills in this window
     this.windowS = seconds;
     this.windowLeft = Math.round(seconds * this.sampleRate);
   }
@@ -132,6 +141,8 @@ export class JitterBuffer {
     }
     if (this.fill < frames + RESERVE) return this.#runDry(outputs, frames);
     this.lowest = Math.min(this.lowest, this.fill);
+    this.sum += this.fill;
+    this.count += 1;
     this.windowLeft -= frames;
     const lag = this.windowLeft <= 0 ? this.#correction() : 0;
     if (lag !== 0 && frames === QUANTUM) this.#splice(outputs, lag);
@@ -162,6 +173,7 @@ export class JitterBuffer {
     this.#ramp(last, FADE.subarray(0, rest - start), start, true);
     this.playing = false;
     this.counters.underruns += 1;
+    this.grownS = Math.min(MAX_HEADROOM_S, this.grownS + GROWTH_S);
     this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);
     return this.#heard(rest);
   }
@@ -170,17 +182,28 @@ export class JitterBuffer {
   #correction() {
     const { lowest } = this;
     this.#remember();
+    this.#adapt();
     this.#openWindow();
-    // Headroom added by a dropout shrinks slowly; that of the start ends at once.
-    if (this.starting > 0 && --this.starting === 0) this.headroomS -= START_S;
-    this.headroomS = Math.max(HEADROOM_S, this.headroomS - 0.0002);
     const headroom = this.headroomS * this.sampleRate;
-    if (lowest < headroom / 2) return this.#bestLag(-1, headroom);
+    if (lowest < Math.max(headroom / 2, LEAST)) return this.#bestLag(-1, headroom);
     if (lowest > headroom + JUMP_S * this.sampleRate) return Math.round((lowest - headroom) / 2);
     const slack = SLACK_S * this.sampleRate;
     const recent = this.#lowestOf(SOON_S) - headroom;
     this.isShortening = recent > (this.isShortening ? slack : MUCH_S * this.sampleRate);
     return this.isShortening || this.#lowestOf(MEMORY_S) - headroom > slack ? this.#bestLag(1, recent - slack / 2) : 0;
+  }
+
+  /** Sets the headroom by the jitter: more at once, less step by step. */
+  #adapt() {
+    if (this.starting > 0) {
+      if (--this.starting === 0) this.headroomS -= START_S; // that of the start ends at once
+      return;
+    }
+    const dipS = (this.sum / this.count - this.lowest) / this.sampleRate;
+    this.jitterS = Math.max(dipS, FORGETTING * this.jitterS);
+    this.grownS = Math.max(0, this.grownS - GIVEN_BACK_S);
+    const wantedS = Math.min(MAX_HEADROOM_S, LEAST / this.sampleRate + MARGIN_S + SHARE_OF_JITTER * this.jitterS + this.grownS);
+    this.headroomS = Math.max(wantedS, this.headroomS - FALL_S);
   }
 
   #remember() {

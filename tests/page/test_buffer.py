@@ -75,20 +75,20 @@ def tone(samples: np.ndarray) -> np.ndarray:
 STEEPEST_TONE = 0.5 * 2 * math.pi * 220 / 24_000
 
 
-SETTLED_S = 10
+SETTLED_S = 25
 """After which the larger buffer of a start has been given back."""
 QUANTA_PER_S = 24_000 / 128
 
 
 def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has_settled(one_page):
-    run = simulate(one_page, {"seconds": 30, "skew": 0, "delays": []})
+    run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": []})
     assert run["counters"]["underruns"] == 0
     assert run["counters"]["splices"] > 0
     assert run["steepest"] < 1.5 * STEEPEST_TONE
     # Pose n is heard with the first sample of block n, and so says where in the tone the output is.
     pose, at = run["heard"][-1]
     delay = at - 256 * pose
-    assert 0.05 < delay / 24_000 < 0.1
+    assert 0.02 < delay / 24_000 < 0.045
     assert all(at - 256 * pose == delay for pose, at in run["heard"] if at > SETTLED_S * 24_000)
     played, first = run["played"], run["before"]
     np.testing.assert_allclose(played, tone(np.arange(first, first + len(played)) - delay), atol=1e-7)
@@ -96,7 +96,7 @@ def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has
 
 def test_a_stall_while_everything_starts_is_not_heard(one_page):
     """A tenth of a second without a block, as where the page draws its map and the sound card opens."""
-    run = simulate(one_page, {"seconds": 14, "skew": 0, "delays": [], "stalls": {"20": 0.1, "60": 0.1}})
+    run = simulate(one_page, {"seconds": 28, "skew": 0, "delays": [], "stalls": {"20": 0.1, "60": 0.1}})
     assert run["counters"]["underruns"] == 0
     fills = run["fills"][round(SETTLED_S * QUANTA_PER_S) :]
     assert fills.mean() < run["targets"][-1] + 0.02
@@ -108,7 +108,7 @@ def test_after_a_dropout_the_buffer_comes_back_to_its_aim(one_page, block, stall
     """What stalled comes in a burst, and would be delay for as long as it is kept."""
     # Blocks come in order: those after it wait for it, and a socket hands them on one by one, so that playing goes on
     # before all of them are there.
-    parameters = {"seconds": 20, "skew": 0, "delays": [], "stalls": {str(block): stall_s}, "spacing": spacing}
+    parameters = {"seconds": 40, "skew": 0, "delays": [], "stalls": {str(block): stall_s}, "spacing": spacing}
     run = simulate(one_page, parameters)
     assert run["counters"]["underruns"] <= 1
     later = round((block * 256 / 24_000 + stall_s + SETTLED_S) * QUANTA_PER_S)
