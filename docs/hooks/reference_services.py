@@ -39,7 +39,7 @@ def http() -> str:
     rows = ((status, described[status]["description"]) for status in sorted(always))
     parts = [f"Whatever the route, a request may be refused:\n\n{table(['status', 'meaning'], rows)}"]
     parts += [_operation(name, operation, always) for name, operation in routes.items()]
-    parts += ["## Objects in answers\n"]
+    parts += ["## Objects in requests and answers\n"]
     for name, schema in document["components"]["schemas"].items():
         if "properties" in schema:
             prose = "\n\n".join(" ".join(each.split()) for each in schema.get("description", "").split("\n\n"))

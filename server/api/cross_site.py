@@ -30,8 +30,8 @@ from server.api.settings import Settings
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
 _EXPOSED = ("ETag", "Retry-After")
-_METHODS = ("GET", "HEAD")
-_HEADERS = ("If-None-Match",)
+_METHODS = ("GET", "HEAD", "POST")
+_HEADERS = ("Content-Type", "If-None-Match")
 _DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
 _FOR_PROGRAMS = ("/v1/", "/metrics")
 """Paths for programs, to which no link of a page leads."""

@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from server.api.problem_codes import PROBLEM_CODES
+from server.responses.response_batch import ResponseBatch
 
 Object = dict[str, Any]
 
@@ -43,8 +44,9 @@ _PROBLEM: Final[Object] = {
         "field": {"anyOf": [{"type": "string"}, {"type": "null"}]},
     },
 }
-_COMPUTED: Final = ("/impulse-response", "/loudness", "/plan")
-_TAGGED: Final = (*_COMPUTED, "/decoder")
+_OF_A_BODY: Final = {"415": "The body is not JSON."}
+_COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/plan")
+_TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder")
 
 
 def install_openapi(app: FastAPI) -> None:
@@ -64,18 +66,23 @@ def describe(app: FastAPI) -> Object:
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
     schemas["Problem"] = _PROBLEM
+    batch = ResponseBatch.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas |= batch.pop("$defs")
+    schemas[ResponseBatch.__name__] = batch
     for path, operations in document["paths"].items():
         for operation in operations.values():
             for parameter in operation.get("parameters", ()):
                 parameter["schema"] = _without_null(parameter["schema"])
-            operation["responses"] |= _refusals(path)
+            operation["responses"] |= _refusals(path, has_body="requestBody" in operation)
             if path.endswith(_TAGGED):
                 operation["responses"]["304"] = {"description": "The client has it already, by its `If-None-Match`."}
     return document
 
 
-def _refusals(path: str) -> Object:
+def _refusals(path: str, *, has_body: bool) -> Object:
     refused = dict(_REFUSED)
+    if has_body:
+        refused |= _OF_A_BODY
     if "{scene}" in path:
         refused |= _OF_A_SCENE
     if "{hrtf}" in path:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 PROBLEM_CODES: Final[Mapping[str, str]] = {
+    "answer_too_long": "409: so many responses of this scene and output are more than the server sends at once",
     "body_too_large": "413: the body is longer than the server takes",
     "contradicting_parameters": "409: two parameters contradict each other; leave one out",
     "doubled_effect": "409: the query switches one effect twice",
@@ -37,6 +38,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "too_many_connections": "503: every connection is in use",
     "too_many_emitters": "422: a plan is asked for with more emitters than a stream may have",
     "too_many_headers": "431: the request has more headers than the server takes",
+    "too_many_poses": "422: more impulse responses are asked for than one request may; send several",
     "unknown_effect": "422: there is no effect of this name; the message lists those there are",
     "unknown_format": "422: the answer cannot be written in this format",
     "unknown_hrtf": "404: there is no such head; `GET /v1/hrtfs` lists them",
@@ -45,6 +47,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "unknown_output": "422: there is no output of this name; the message lists those there are",
     "unknown_parameter": "422: the route has no parameter of this name; the message suggests the nearest",
     "unknown_scene": "404: there is no scene of this id",
+    "unsupported_media_type": "415: the body is of another type than the route reads",
     "unsupported_sample_rate": "404: no scene has this sample rate; the message lists those there are",
     "upgrade_required": "426: the address is a WebSocket; connect with ws:// or wss://",
 }

@@ -1,9 +1,9 @@
 """Computation and cache of HTTP response bodies that take time to compute. A few threads compute them, at a lower
 priority than the workers of streams. Bodies are cached by entity tag, which identifies a body completely.
 
-Requests with the same tag share one computation, which is cancelled when no request waits for it any more. The two
-kinds of computation take turns, and within a kind the clients do. Maps never take the last thread, so that cheap
-requests need not wait for them.
+Requests with the same tag share one computation, which is cancelled when no request waits for it any more. The kinds
+of computation take turns, and within a kind the clients do. Maps never take the last thread, so that cheap requests
+need not wait for them. A batch is computed part by part, each when its turn comes.
 
 A `ResponseCache` belongs to the event loop. Computations run on its threads.
 """
@@ -13,7 +13,7 @@ import contextlib
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable, Iterable
 from concurrent.futures import CancelledError
 from functools import partial
 from typing import Literal, Self, get_args
@@ -24,8 +24,8 @@ from server.runtime.pace import Checkpoint, CpuBudget, Pace
 from server.runtime.priority import become_background
 from server.runtime.thread_pool import ThreadPool
 
-Kind = Literal["single", "map"]
-"""Computations that take milliseconds, and those that take seconds."""
+Kind = Literal["single", "batch", "map"]
+"""Computations that take milliseconds, parts of a longer answer that do, and those that take seconds."""
 Compute = Callable[[Checkpoint], bytes]
 
 _MAX_BYTES = 32 * 1024 * 1024
@@ -34,21 +34,25 @@ _NICENESS = 10
 _PATIENCE_S = 300.0
 """The longest map takes two minutes, and longer while streams are busy."""
 _STOP_S = 1.0
-_FIRST_GUESS_S = {"single": 0.05, "map": 5.0}
+_FIRST_GUESS_S = {"single": 0.05, "batch": 0.05, "map": 5.0}
 _SMOOTHING = 0.3
 _LONGEST_RETRY_S = 120
 _MOST_CLIENTS = 256
 
 
 class _Computation:
-    """The computation of one body, which all requests with its entity tag wait for."""
+    """The computation of one body, which all requests with its entity tag wait for, or one alone if it has no tag."""
 
-    def __init__(self, etag: str, compute: Compute, kind: Kind, client: str) -> None:
+    def __init__(
+        self, etag: str | None, compute: Compute, kind: Kind, client: str, *, keeps_place: bool = False
+    ) -> None:
         self.etag = etag
         self.compute = compute
         self.kind: Kind = kind
         self.client = client
         """Address of the first client that asked."""
+        self.keeps_place = keeps_place
+        """Whether this waits although no room is left, and loses its place to nobody."""
         self.body: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self.waiters = 0
         self.is_called_off = False
@@ -83,6 +87,8 @@ class ResponseCache:
         self._bodies: BoundedCache[str, bytes] = BoundedCache(_MAX_BYTES)
         self._by_tag: dict[str, _Computation] = {}
         self._waiting: deque[_Computation] = deque()
+        self._batches: Counter[str] = Counter()
+        """Batches under way, by client."""
         self._running: list[_Computation] = []
         self._turns: deque[Kind] = deque(get_args(Kind))
         self._served: dict[tuple[Kind, str], int] = {}
@@ -120,6 +126,24 @@ class ResponseCache:
         computation = self._by_tag.get(etag)
         if computation is None:
             computation = self._admit(_Computation(etag, compute, kind, client))
+        return await self._result(computation)
+
+    async def batch(self, parts: Iterable[Compute], *, client: str) -> AsyncGenerator[bytes]:
+        """The computed parts of one answer, which are not cached. Each is computed only when the one before has been
+        taken. A batch under way keeps its place: after the first part none is refused. If the generator is closed, or
+        waiting for it cancelled, nothing more is computed. Raises what `get` raises; and server_busy if as many batches
+        are under way as computations may wait, or half as many of this client."""
+        if self._batches.total() >= self._most_waiting or self._batches[client] >= max(1, self._most_waiting // 2):
+            raise self._busy()
+        self._batches[client] += 1
+        try:
+            for number, compute in enumerate(parts):
+                computation = _Computation(None, compute, "batch", client, keeps_place=number > 0)
+                yield await self._result(self._admit(computation))
+        finally:
+            self._batches -= Counter([client])
+
+    async def _result(self, computation: _Computation) -> bytes:
         computation.waiters += 1
         try:
             return await asyncio.shield(computation.body)
@@ -131,20 +155,23 @@ class ResponseCache:
     def _admit(self, computation: _Computation) -> _Computation:
         """Queue a computation. If there is no room, the client with the most waiting computations loses its newest one,
         or this one is refused."""
-        is_full = len(self._waiting) >= self._most_waiting and not self._may_start(computation.kind)
-        if is_full and not self._make_room(computation.client):
+        waiting = sum(not each.keeps_place for each in self._waiting)
+        is_full = waiting >= self._most_waiting and not self._may_start(computation.kind)
+        if is_full and not computation.keeps_place and not self._make_room(computation.client):
             raise self._busy()
-        self._by_tag[computation.etag] = computation
+        if computation.etag is not None:
+            self._by_tag[computation.etag] = computation
         self._waiting.append(computation)
         self._start()
         return computation
 
     def _make_room(self, client: str) -> bool:
-        counts = Counter(each.client for each in self._waiting)
+        displaceable = [each for each in self._waiting if not each.keeps_place]
+        counts = Counter(each.client for each in displaceable)
         greediest, most = max(counts.items(), key=lambda item: item[1])
         if most <= counts[client] + 1:
             return False
-        newest = next(each for each in reversed(self._waiting) if each.client == greediest)
+        newest = next(each for each in reversed(displaceable) if each.client == greediest)
         self._forget(newest)
         self._waiting.remove(newest)
         newest.body.set_exception(self._busy())
@@ -167,7 +194,7 @@ class ResponseCache:
 
     def _forget(self, computation: _Computation) -> None:
         """Let later requests with the same tag start a new computation."""
-        if self._by_tag.get(computation.etag) is computation:
+        if computation.etag is not None and self._by_tag.get(computation.etag) is computation:
             del self._by_tag[computation.etag]
 
     def _may_start(self, kind: Kind) -> bool:
@@ -222,7 +249,8 @@ class ResponseCache:
             computation.body.set_exception(failure)
             return
         self._takes_s[computation.kind] += _SMOOTHING * (took_s - self._takes_s[computation.kind])
-        self._bodies.put(computation.etag, body, len(body))
+        if computation.etag is not None:
+            self._bodies.put(computation.etag, body, len(body))
         computation.body.set_result(body)
 
     def _free(self, computation: _Computation) -> None:

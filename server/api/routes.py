@@ -1,13 +1,18 @@
 """HTTP and WebSocket endpoints. Angles are in degrees and positions in metres."""
 
 import json
+from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response, WebSocket
+from fastapi.responses import StreamingResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BeforeValidator, Field
+from starlette.requests import ClientDisconnect
+from starlette.types import Receive, Scope, Send
 
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.api.asyncapi import document
@@ -40,6 +45,7 @@ from server.responses.impulse_response import (
     parse_position,
 )
 from server.responses.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
+from server.responses.response_batch import BATCH_EXAMPLE, BATCH_MEDIA_TYPES, ResponseBatch
 from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
 
@@ -73,6 +79,16 @@ EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
 _IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 _DECODER_TYPES = {"content": {each: _IR_TYPES["content"][each] for each in DECODER_MEDIA_TYPES.values()}}
+_BATCH_TYPES = {"content": dict.fromkeys({*BATCH_MEDIA_TYPES.values()}, _IR_TYPES["content"]["audio/wav"])}
+_BATCH_BODY = {
+    "required": True,
+    "content": {
+        "application/json": {
+            "schema": {"$ref": f"#/components/schemas/{ResponseBatch.__name__}"},
+            "example": BATCH_EXAMPLE,
+        },
+    },
+}
 _MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 _MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
@@ -191,6 +207,40 @@ async def impulse_response(
         MEDIA_TYPES[name],
         lambda _: ImpulseResponse.compute(field, query, filters).encode(name),
     )
+
+
+@api.post(
+    "/scenes/{scene}/impulse-responses",
+    response_class=Response,
+    responses={200: _BATCH_TYPES},
+    openapi_extra={"requestBody": _BATCH_BODY},
+)
+async def impulse_responses(request: Request, scene: str) -> Response:
+    """Impulse responses between many pairs of places, the same as single ones, in one file. It is sent while it is
+    computed: a connection that ends before the file does says that something failed."""
+    levels, host = _levels(request, scene), _host(request)
+    _require_json(request)
+    try:
+        text = await request.body()
+    except ClientDisconnect:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    batch = ResponseBatch.parse(text, most=host.settings.max_poses)
+    field = levels.choose(batch.level)
+    queries = batch.queries(field)
+    filters = host.hrtfs.filters(queries[0].hrtf, field.sample_rate)
+    writer = batch.writer(queries)
+
+    def add(query: IrQuery, _: Checkpoint) -> bytes:
+        return writer.add(ImpulseResponse.compute(field, query, filters))
+
+    parts: list[Compute] = [partial(add, query) for query in queries]
+    answer = host.responses.batch([*parts, lambda _: writer.end()], client=_client(request))
+    try:
+        # What is wrong with the first response is told before the answer begins.
+        first = await run_until(anext(answer), _disconnected(request))
+    except StoppedError:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    return _BatchResponse(first, answer, BATCH_MEDIA_TYPES[batch.file_format])
 
 
 @api.get("/scenes/{scene}/loudness", response_class=Response, responses={200: _MAP_TYPES})
@@ -344,6 +394,37 @@ async def stream(websocket: WebSocket) -> None:
     await Connection(websocket, _host(websocket), fast_path=fast_path(websocket.scope)).run()
 
 
+class _BatchResponse(StreamingResponse):
+    """The parts of an answer. They are computed as long as the client takes them."""
+
+    def __init__(self, first: bytes, others: AsyncGenerator[bytes], media_type: str) -> None:
+        super().__init__(self._parts(first), media_type=media_type, headers={"Cache-Control": "no-store"})
+        self._others = others
+
+    async def _parts(self, first: bytes) -> AsyncIterator[bytes]:
+        yield first
+        async for part in self._others:
+            yield part
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            await self._others.aclose()
+
+
+def _require_json(request: Request) -> None:
+    """Raises RequestError unsupported_media_type for a body that is said to be something else."""
+    kind = request.headers.get("content-type", "application/json").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        problem = f"the body is {kind[:80]!r}, and JSON is needed: send Content-Type: application/json"
+        raise RequestError("unsupported_media_type", problem, status=415)
+
+
+def _client(request: Request) -> str:
+    return "" if request.client is None else request.client.host
+
+
 def _host(connection: Request | WebSocket) -> StreamHost:
     host = connection.state.host
     assert isinstance(host, StreamHost)
@@ -370,8 +451,7 @@ async def _cached(request: Request, etag: str, media_type: str, compute: Compute
 
 async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
     """The cached or computed body; None if the client has gone meanwhile."""
-    client = "" if request.client is None else request.client.host
-    computing = _host(request).responses.get(etag, compute, kind=kind, client=client)
+    computing = _host(request).responses.get(etag, compute, kind=kind, client=_client(request))
     try:
         return await run_until(computing, _disconnected(request))
     except StoppedError:

@@ -128,7 +128,9 @@ class Settings(BaseSettings):
     max_headers_bytes: Annotated[int, Field(ge=1024)] = 32 * 1024
     """Longest headers of a request, all together. A single header and the request line may have 8,000 bytes each."""
     max_body_bytes: Annotated[int, Field(ge=0, le=64 * 1024)] = 64 * 1024
-    """Longest body of a request. No route needs one."""
+    """Longest body of a request."""
+    max_poses: Annotated[int, Field(ge=1)] = 256
+    """Impulse responses that one request may ask for."""
     max_connections: Annotated[int, Field(ge=1)] = 1024
     """Connections in total. If all are taken, a new one replaces the one that has been idle for longest; if none is
     idle, only health checks are answered."""

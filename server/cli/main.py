@@ -19,6 +19,7 @@ from server.bench import cli as bench
 from server.bench.capacity_cli import plan_capacity
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
 from server.core.errors import NafirError, RequestError
+from server.core.files import require_readable
 from server.health.cli import check
 from server.listening.cli import listening_results, listening_test
 from server.rendering.partitions import BLOCK_SIZES, is_block_size
@@ -215,6 +216,65 @@ def ir(
             "channels": list(response.channels),
             "samples": response.samples.shape[1],
             "duration_ms": round(duration_ms, 3),
+        },
+    )
+
+
+@app.command()
+def irs(
+    scene: Scene,
+    poses: Annotated[
+        Path, typer.Argument(help="JSON: the body of POST /v1/scenes/{scene}/impulse-responses.", metavar="POSES")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="File to write: .npz, .zip of WAV or .sofa.", callback=writable_file),
+    ],
+    hrtf: Hrtf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the impulse responses of many pairs of places to one file."""
+    from server.assets.hrtfs import HrtfLibrary
+    from server.field.field import AcousticField
+    from server.field.fields_by_level import require_level
+    from server.responses.impulse_response import ImpulseResponse
+    from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
+    from server.scene.bundle import Bundle, find_bundle
+
+    name = output.suffix.removeprefix(".")
+    if name not in BATCH_FORMATS:
+        raise RequestError("unknown_format", f"{output}: its name ends in .{', .'.join(BATCH_FORMATS)}", field="output")
+    require_readable(poses, "poses")
+    batch = ResponseBatch.parse(poses.read_bytes())
+    if batch.format not in {None, name}:
+        raise NafirError(f"{poses}: format: is {batch.format}, and --output is {output}: leave the format out")
+    bundle = Bundle.load(find_bundle(scene))
+    field = AcousticField.load(bundle, level=None if batch.level is None else require_level(bundle, batch.level))
+    batch = batch.model_copy(update={"format": name, "hrtf": hrtf.stem if hrtf and not batch.hrtf else batch.hrtf})
+    queries = batch.queries(field)
+    filters = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate]).filters(
+        queries[0].hrtf, field.sample_rate
+    )
+    writer = batch.writer(queries)
+    started_s = time.perf_counter()
+    try:
+        with output.open("wb") as file:
+            for query in queries:
+                file.write(writer.add(ImpulseResponse.compute(field, query, filters)))
+            file.write(writer.end())
+    except OSError as exc:
+        raise NafirError(f"{output}: {exc.strerror}") from exc
+    duration_s = time.perf_counter() - started_s
+    _report(
+        as_json,
+        f"{output}: {len(queries)} responses, computed in {duration_s:.2f} s",
+        {
+            "output": str(output),
+            "scene": bundle.id,
+            "level": field.level.name,
+            "sample_rate": field.sample_rate,
+            "responses": len(queries),
+            "duration_s": round(duration_s, 3),
         },
     )
 

@@ -39,6 +39,12 @@ def parse_integer(text: str) -> int:
     return int(number)
 
 
+def as_whole(value: object) -> object:
+    """The integer that a JSON number such as 1.0 is by JSON Schema; encoders of Lua and C# write integers so. Anything
+    else is returned as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 def _fault(number: str) -> str:
     if _NOT_FINITE.fullmatch(number):
         return "not finite"

@@ -1,17 +1,14 @@
 """The base class and the common types of all messages of a stream."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat
 
+from server.core.numerals import as_whole
 
-def _read_whole(value: Any) -> Any:
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-WHOLE = BeforeValidator(_read_whole)
-"""Accepts 1.0 as an integer, as JSON Schema does; JSON encoders of Lua and C# write integers so. It has to come after
-the other annotations of a number, or the schema leaves those out."""
+WHOLE = BeforeValidator(as_whole)
+"""Accepts 1.0 as an integer (`as_whole`). It has to come after the other annotations of a number, or the schema leaves
+those out."""
 Integer = Annotated[int, WHOLE]
 Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 

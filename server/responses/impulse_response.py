@@ -8,8 +8,9 @@ the left ear and the right one; or the harmonics of an ambisonic response (ACN, 
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, Unpack, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -104,6 +105,17 @@ def parse_order(output: IrOutput | None, order: int | None) -> int | None:
     return order
 
 
+class QueryOptions(TypedDict, total=False):
+    """Options of `IrQuery.checked` that are no text."""
+
+    yaw_deg: float | None
+    pitch_deg: float | None
+    roll_deg: float | None
+    output: str | None
+    order: int | None
+    hrtf: str | None
+
+
 @dataclass(frozen=True)
 class IrQuery:
     """The poses of an IR, and for what it is computed.
@@ -136,15 +148,34 @@ class IrQuery:
         listener: str,
         emitter: str,
         *,
+        orientation: str | None = None,
+        **other: Unpack["QueryOptions"],
+    ) -> "IrQuery":
+        """Read a query for a field from texts, and check it (`checked`)."""
+        return cls.checked(
+            field,
+            parse_position(listener, "listener"),
+            parse_position(emitter, "emitter"),
+            orientation=None if orientation is None else parse_orientation(orientation, "orientation"),
+            **other,
+        )
+
+    @classmethod
+    def checked(
+        cls,
+        field: AcousticField,
+        listener: Vector3,
+        emitter: Vector3,
+        *,
+        orientation: Quaternion | None = None,
         yaw_deg: float | None = None,
         pitch_deg: float | None = None,
         roll_deg: float | None = None,
-        orientation: str | None = None,
         output: str | None = None,
         order: int | None = None,
         hrtf: str | None = None,
     ) -> "IrQuery":
-        """Read a query for a field; None stands for what is not given. Queries with equal answers are equal.
+        """Return the query for a field; None stands for what is not given. Queries with equal answers are equal.
 
         Raises RequestError, which names the parameter, for what cannot be read, is outside the scene or contradicts
         another parameter, and for ambisonics of a field that knows no directions.
@@ -171,10 +202,10 @@ class IrQuery:
                 status=409,
             )
         query = cls(
-            parse_position(listener, "listener"),
-            parse_position(emitter, "emitter"),
+            listener,
+            emitter,
             **{name: value or 0.0 for name, value in angles.items()},
-            orientation=None if orientation is None else parse_orientation(orientation, "orientation"),
+            orientation=orientation,
             output=None if wanted == own else wanted,
             order=parse_order(wanted, order),
             hrtf=DEFAULT_HRTF if hrtf is None else hrtf,
@@ -303,25 +334,29 @@ class ImpulseResponse:
             case "json":
                 buffer.write(json.dumps(self._document()).encode())
             case "sofa":
-                buffer.write(self._sofa())
+                buffer.write(self.sofa_head([self.query]) + self.sofa_samples())
         return buffer.getvalue()
 
-    def _sofa(self) -> bytes:
-        from server.responses.room_sofa import room_sofa
+    def sofa_head(self, queries: Sequence[IrQuery]) -> bytes:
+        """Return the beginning of a SOFA file of the responses to `queries`, which have this one's output, head and
+        length. The `sofa_samples` of each have to follow."""
+        from server.responses.room_sofa import Measurement, room_sofa_head
 
         assert self.bundle is not None  # of every response that was computed
-        query = self.query
-        return room_sofa(
+        of_head = self.bundle.manifest.direct_sound == "geometry" or self.query.output == "binaural"
+        return room_sofa_head(
             self.bundle,
-            self.samples,
+            [Measurement(each.listener, Quaternion(*orientations_of(each.heads)[0]), each.emitter) for each in queries],
             self.channels,
+            samples=self.samples.shape[1],
             level=self.level,
-            listener=query.listener,
-            orientation=Quaternion(*orientations_of(query.heads)[0]),
-            emitter=query.emitter,
-            head=query.hrtf if self.bundle.manifest.direct_sound == "geometry" or query.output == "binaural" else None,
-            order=query.order,
+            head=self.query.hrtf if of_head else None,
+            order=self.query.order,
         )
+
+    def sofa_samples(self) -> bytes:
+        """Return the samples as they stand in a SOFA file."""
+        return self.samples.astype("<f8").tobytes()
 
     def _document(self) -> dict[str, object]:
         return {

@@ -1,20 +1,22 @@
 """Impulse responses of a room as SOFA files (AES69-2022, convention SingleRoomSRIR), with the places and axes of
 listener and source.
 
-Axes are those of the scene, in metres. Receivers are two ears, one omnidirectional microphone, or the harmonics of an
-ambisonic response: type "spherical harmonics", of which the standard fixes neither order nor norm, so that their
-descriptions name both. A room that is not a box has the type "reverberant" with its corners in words, since the
-standard would have it drawn in a file of its own. Dates are 1970, so that the same response is the same bytes.
+Axes are those of the scene, in metres. A file has a measurement for each pair of places. Receivers are two ears, one
+omnidirectional microphone, or the harmonics of an ambisonic response: type "spherical harmonics", of which the standard
+fixes neither order nor norm, so that their descriptions name both. A room that is not a box has the type "reverberant"
+with its corners in words, since the standard would have it drawn in a file of its own. Dates are 1970, so that the same
+response is the same bytes.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan, Quaternion, Vector3, axes_of
-from server.rendering.sofa_writer import Variable, sofa_bytes
+from server.rendering.sofa_writer import LastVariable, Variable, sofa_head
 from server.scene.bundle import Bundle
 
 _UNDATED = "1970-01-01 00:00:00"
@@ -22,23 +24,32 @@ _EAR_M = 0.0875
 """Metres from the middle of the head to an ear: the radius that delays of first reflections assume too."""
 _METRES = {"Type": "cartesian", "Units": "metre"}
 _KELVIN = 273.15
+_COUNTED = ("a computed room impulse response", "computed room impulse responses")
 
 
-def room_sofa(
+@dataclass(frozen=True)
+class Measurement:
+    """Where a response is heard, with the head's orientation, and where its sound comes from."""
+
+    listener: Vector3
+    orientation: Quaternion
+    emitter: Vector3
+
+
+def room_sofa_head(
     bundle: Bundle,
-    samples: npt.NDArray[np.float32],
+    measurements: Sequence[Measurement],
     channels: Sequence[str],
     *,
+    samples: int,
     level: str,
-    listener: Vector3,
-    orientation: Quaternion,
-    emitter: Vector3,
     head: str | None,
     order: int | None,
 ) -> bytes:
-    """Return the file of a response (channel, sample) in a bundle's scene. `head` is the name of a head for two ears,
-    `order` that of an ambisonic response."""
-    ahead, _, up = axes_of(orientation)
+    """Return the file of responses (channel, sample) in a bundle's scene, up to the responses themselves, which have to
+    follow in the order of their `measurements`, as 64-bit floats, little-endian. `head` is the name of a head for two
+    ears, `order` that of ambisonic responses."""
+    views = np.array([axes_of(each.orientation) for each in measurements])
     walls, room = _room(bundle)
     rate = float(bundle.manifest.codec.sample_rate)
     receivers, receiver_metres = _receivers(channels, order)
@@ -49,7 +60,7 @@ def room_sofa(
         "SOFAConventions": "SingleRoomSRIR",
         "SOFAConventionsVersion": "1.0",
         "DataType": "FIR",
-        "Title": f"{bundle.manifest.name}: a computed room impulse response",
+        "Title": f"{bundle.manifest.name}: {_COUNTED[len(measurements) > 1]}",
         "DateCreated": _UNDATED,
         "DateModified": _UNDATED,
         "APIName": "Nafir",
@@ -65,25 +76,31 @@ def room_sofa(
         "ListenerDescription": _listener(channels, head, order),
         "SourceDescription": "omnidirectional",
     } | walls
-    axes = {"ListenerView": ahead, "ListenerUp": up, "SourceView": np.eye(3)[0], "SourceUp": np.eye(3)[2]}
+    still = np.broadcast_to(np.eye(3), (len(measurements), 3, 3))
+    axes = {
+        "ListenerView": views[:, 0],
+        "ListenerUp": views[:, 2],
+        "SourceView": still[:, 0],
+        "SourceUp": still[:, 2],
+    }
     variables = {
-        "ListenerPosition": _points("MC", listener),
-        **{name: _points("MC", values, described=name.endswith("View")) for name, values in axes.items()},
+        "ListenerPosition": _points([each.listener for each in measurements]),
+        **{name: _points(values, described=name.endswith("View")) for name, values in axes.items()},
         "ReceiverPosition": Variable("RCI", receivers[..., np.newaxis], receiver_metres),
         "ReceiverDescriptions": Variable("RS", list(descriptions)),
-        "SourcePosition": _points("MC", emitter),
+        "SourcePosition": _points([each.emitter for each in measurements]),
         "EmitterPosition": Variable("ECI", np.zeros((1, 3, 1)), _METRES),
         "RoomTemperature": Variable("I", np.array([bundle.manifest.air.temperature_c + _KELVIN]), {"Units": "kelvin"}),
         **room,
-        "Data.IR": Variable("MRN", samples[np.newaxis].astype(np.float64)),
         "Data.SamplingRate": Variable("I", np.array([rate]), {"Units": "hertz"}),
         "Data.Delay": Variable("IR", np.zeros((1, len(channels)))),
     }
-    return sofa_bytes(attributes, variables)
+    last = LastVariable("Data.IR", "MRN", (len(measurements), len(channels), samples))
+    return sofa_head(attributes, variables, last)
 
 
-def _points(dimensions: str, values: Sequence[float] | npt.NDArray[np.float64], *, described: bool = True) -> Variable:
-    return Variable(dimensions, np.array([values], dtype=np.float64), _METRES if described else {})
+def _points(values: Sequence[Vector3] | npt.NDArray[np.float64], *, described: bool = True) -> Variable:
+    return Variable("MC", np.array(values, dtype=np.float64), _METRES if described else {})
 
 
 def _receivers(channels: Sequence[str], order: int | None) -> tuple[npt.NDArray[np.float64], dict[str, str]]:

@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from concurrent.futures import CancelledError
+from functools import partial
 
 import pytest
 
@@ -178,3 +179,95 @@ def test_leaving_calls_off_what_runs(work):
 
     scenario(run)
     assert work.called_off == ["x"]
+
+
+async def taken(parts):
+    return [each async for each in parts]
+
+
+def test_a_batch_is_computed_part_by_part_as_it_is_taken(work):
+    async def run(cache):
+        parts = cache.batch([work.of("a"), work.of("b")], client="x")
+        work.release()
+        first = await anext(parts)
+        await asyncio.sleep(0.05)
+        begun = list(work.begun)
+        return first, begun, await taken(parts)
+
+    assert scenario(run) == (b"a", ["a"], [b"b"])
+
+
+def test_a_batch_that_is_no_longer_taken_stops(work):
+    async def run(cache):
+        taking = asyncio.create_task(taken(cache.batch([work.of("a"), work.of("b")], client="x")))
+        await until(lambda: work.begun)
+        taking.cancel()
+        await until(lambda: work.called_off)
+        await asyncio.wait({taking})
+        # Its place is free again.
+        again = cache.batch([work.of("c")], client="x")
+        work.release()
+        assert await taken(again) == [b"c"]
+
+    scenario(run, waiting=1)
+    assert work.begun == ["a", "c"]
+
+
+def test_other_requests_take_turns_with_a_batch(work):
+    def as_many(cache, begun, waiting):
+        return (len(work.begun), cache.waiting) == (begun, waiting)
+
+    async def run(cache):
+        batch = asyncio.create_task(taken(cache.batch([work.of(name) for name in "abc"], client="x")))
+        await until(lambda: work.begun)
+        singles = [
+            asyncio.create_task(cache.get(name, work.of(name), kind="single", client="y")) for name in ("1", "2")
+        ]
+        for number, waiting in enumerate((2, 2, 1, 1), start=1):
+            await until(partial(as_many, cache, number, waiting))
+            work.release(work.begun[-1])
+        work.release()
+        await asyncio.gather(batch, *singles)
+
+    scenario(run)
+    assert work.begun == ["a", "1", "b", "2", "c"]
+
+
+def test_a_batch_under_way_keeps_its_place_and_takes_nobody_elses(work):
+    async def run(cache):
+        blocker = asyncio.create_task(cache.get("0", work.of("0"), kind="single", client="z"))
+        batch = asyncio.create_task(taken(cache.batch([work.of("a"), work.of("b")], client="x")))
+        await until(lambda: work.begun and cache.waiting == 1)
+        work.release("0")
+        await until(lambda: "a" in work.begun)
+        held = asyncio.create_task(cache.get("1", work.of("1"), kind="single", client="z"))
+        await until(lambda: cache.waiting == 1)
+        work.release("a")
+        await until(lambda: "1" in work.begun and cache.waiting == 1)  # "b" waits
+        waiting = asyncio.create_task(cache.get("2", work.of("2"), kind="single", client="y"))
+        await until(lambda: cache.waiting == 2)  # there was room, although "b" waits
+        with pytest.raises(RequestError, match="ask again"):
+            await cache.get("3", work.of("3"), kind="single", client="y")
+        work.release()
+        await asyncio.gather(blocker, held, waiting)
+        return await batch
+
+    assert scenario(run, waiting=1) == [b"a", b"b"]
+
+
+def test_one_client_has_at_most_half_of_the_batches(work):
+    async def run(cache):
+        parts = {name: work.of(name) for name in "abcde"}
+        work.release()
+        under_way = [cache.batch([parts[name], parts["c"]], client="x") for name in "ab"]
+        for each in under_way:
+            await anext(each)
+        with pytest.raises(RequestError) as refused:
+            await taken(cache.batch([parts["c"]], client="x"))
+        assert refused.value.code == "server_busy"
+        assert await taken(cache.batch([parts["d"]], client="y")) == [b"d"]
+        await under_way[0].aclose()
+        assert await taken(cache.batch([parts["e"]], client="x")) == [b"e"]
+        await under_way[1].aclose()
+
+    scenario(run, waiting=4)

@@ -4,9 +4,11 @@ import json
 import re
 import threading
 import time
+import zipfile
 from contextlib import contextmanager
 from itertools import count
 
+import netCDF4
 import numpy as np
 import pytest
 import soundfile
@@ -17,15 +19,19 @@ from server.api import app
 from server.api.app import create_app
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
+from server.core.errors import FieldError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
 from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
+from server.responses.response_batch import BATCH_FORMATS, BATCH_MEDIA_TYPES
 from tests.directional_flat import write_directional
 from tests.killing import kill, threads_may_die
 
 IR = "/v1/scenes/flat/impulse-response"
+BATCH = "/v1/scenes/flat/impulse-responses"
+POSE = {"listener": [1, 2, 1.5], "emitter": [6, 3, 1.5]}
 DECODER = "/v1/hrtfs/kemar/decoder"
 PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
 HEADINGS_DEG = count(1)
@@ -192,6 +198,72 @@ def test_every_output_is_what_the_query_computes(directional_client, asked, name
         IR, params={**PLACES, **asked, "format": name}, headers={"If-None-Match": response.headers["etag"]}
     )
     assert again.status_code == 304
+
+
+@pytest.mark.parametrize("name", BATCH_FORMATS)
+def test_many_responses_are_the_single_ones(directional_client, name):
+    poses = [
+        {"listener": [1, 2, 1.5], "emitter": [6, 3, 1.5], "yaw_deg": 90},
+        {"listener": [2, 2, 1.25], "emitter": [6, 3, 1.5], "orientation": [0, 0.1, 0, 1]},
+    ]
+    answer = directional_client.post(BATCH, json={"poses": poses, "output": "ambisonics", "format": name})
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == BATCH_MEDIA_TYPES[name]
+    assert answer.headers["cache-control"] == "no-store"
+    for number, pose in enumerate(poses):
+        params = {key: ",".join(map(str, value)) if isinstance(value, list) else value for key, value in pose.items()}
+        single = directional_client.get(IR, params={**params, "output": "ambisonics", "format": "npy"})
+        samples = np.load(io.BytesIO(single.content))
+        match name:
+            case "npz":
+                mine = np.load(io.BytesIO(answer.content))["responses"][number]
+            case "zip":
+                with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+                    file = io.BytesIO(archive.read(f"{number}.wav"))
+                mine = soundfile.read(file, dtype="float32")[0].T
+            case "sofa":
+                with netCDF4.Dataset("batch", memory=answer.content) as file:
+                    mine = np.asarray(file["Data.IR"][number])
+        np.testing.assert_array_equal(mine, samples)
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "code", "at_fault"),
+    [
+        (
+            {"json": {"poses": [POSE, {**POSE, "listener": [99, 2, 1.5]}]}},
+            404,
+            "position_out_of_bounds",
+            "poses[1].listener",
+        ),
+        ({"json": {"poses": [POSE], "level": "best"}}, 404, "unknown_level", "level"),
+        ({"json": {"poses": [POSE], "hrtf": "mine"}}, 404, "unknown_hrtf", "hrtf"),
+        ({"json": {"poses": [POSE] * 257}}, 422, "too_many_poses", "poses"),
+        ({"json": {}}, 422, "malformed_request", "poses"),
+        ({"content": b"{"}, 422, "malformed_request", None),
+        ({"data": {"poses": "1"}}, 415, "unsupported_media_type", None),
+    ],
+)
+def test_bad_batches_are_answered_with_a_problem(shared_client, options, status, code, at_fault):
+    check_problem(shared_client.post(BATCH, **options), status, code, at_fault)
+
+
+def test_a_batch_whose_first_response_fails_is_a_problem_and_later_ones_cut_the_answer(client, field):
+    compute, calls = field.impulse_responses, count(1)
+
+    def failing(*arguments, **options):
+        if next(calls) in {1, 3}:
+            raise FieldError("the field broke")
+        return compute(*arguments, **options)
+
+    field.impulse_responses = failing
+    request = {"poses": [POSE, {**POSE, "yaw_deg": 10}]}
+    check_problem(client.post(BATCH, json=request), 500, "no_response")
+    answer = client.post(BATCH, json=request)
+    with pytest.raises(zipfile.BadZipFile):
+        np.load(io.BytesIO(answer.content))
+    field.impulse_responses = compute
+    assert np.load(io.BytesIO(client.post(BATCH, json=request).content))["responses"].shape[0] == 2
 
 
 def test_another_head_has_another_response_and_tag(directional_client):

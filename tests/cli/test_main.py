@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+import zipfile
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from server.offline.render import PathPoint, RenderedEmitter, render
 from server.rendering.hrtf import KEMAR
 from server.responses.direct_sound import DirectSound
 from server.responses.impulse_response import ImpulseResponse, IrQuery
+from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel
 from tests.directional_flat import write_directional
@@ -96,6 +98,58 @@ def test_ir_is_heard_through_the_head_of_a_file(nafir, bundle, field, tmp_path):
     assert document["hrtf"] == "mine"
     usual = ImpulseResponse.compute(field, IrQuery((1.0, 2.0, 1.5), (6.0, 3.0, 1.5))).samples
     np.testing.assert_allclose(document["samples"], usual, atol=1e-4)
+
+
+POSES = {
+    "poses": [
+        {"listener": [1, 2, 1.5], "emitter": [6, 3, 1.5], "yaw_deg": 90},
+        {"listener": [2, 2, 1.5], "emitter": [6, 3, 1.5]},
+    ]
+}
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """Writes a file of poses, with more keys."""
+
+    def write(**more):
+        path = tmp_path / "poses.json"
+        path.write_text(json.dumps({**POSES, **more}))
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("suffix", BATCH_FORMATS)
+def test_irs_writes_what_http_answers(nafir, bundle, field, poses, tmp_path, suffix):
+    output = tmp_path / f"irs.{suffix}"
+    code, said, _ = nafir("irs", bundle.folder, poses(), "-o", output, "--json")
+    assert code == 0
+    assert json.loads(said)["responses"] == 2
+    batch = ResponseBatch.parse(json.dumps({**POSES, "format": suffix}).encode())
+    writer = batch.writer(queries := batch.queries(field))
+    parts = [writer.add(ImpulseResponse.compute(field, query)) for query in queries]
+    assert output.read_bytes() == b"".join([*parts, writer.end()])
+
+
+def test_irs_are_heard_through_the_head_of_a_file(nafir, bundle, poses, tmp_path):
+    head = shutil.copy(KEMAR, tmp_path / "mine.sofa")
+    output = tmp_path / "irs.zip"
+    assert nafir("irs", bundle.folder, poses(), "--hrtf", head, "-o", output)[0] == 0
+    with zipfile.ZipFile(output) as archive:
+        assert [each["hrtf"] for each in json.loads(archive.read("poses.json"))["poses"]] == ["mine", "mine"]
+
+
+def test_irs_that_cannot_be_written_are_refused(nafir, bundle, poses, tmp_path):
+    output = tmp_path / "irs.npz"
+    check_error(nafir("irs", bundle.folder, poses(), "-o", tmp_path / "irs.wav"), "irs.wav", ".npz, .zip, .sofa")
+    check_error(nafir("irs", bundle.folder, poses(format="sofa"), "-o", output), "format", "sofa")
+    check_error(nafir("irs", bundle.folder, poses(hrtf="mine"), "-o", output), "mine")
+    check_error(nafir("irs", bundle.folder, tmp_path / "none.json", "-o", output), "none.json", "no such file")
+    check_error(nafir("irs", bundle.folder, poses(level="best"), "-o", output), "best")
+    far = POSES["poses"][0] | {"emitter": [99, 0, 0]}
+    check_error(nafir("irs", bundle.folder, poses(poses=[far]), "-o", output), "poses[0]", "emitter")
+    assert not output.exists()
 
 
 @pytest.fixture
