@@ -1,0 +1,136 @@
+// Messages of /v1/stream, protocol 3: binary ones are little endian, text ones are JSON. Without a type of Unity's.
+
+using System;
+using System.Globalization;
+using System.Text;
+
+namespace Nafir
+{
+    /// <summary>A block of rendered audio. `Samples` are interleaved.</summary>
+    public sealed class NafirBlock
+    {
+        public uint Sequence, PoseId, ReverberationPoseId;
+        public ulong SampleClock;
+        public byte Flags;
+        public int Channels, Frames;
+        public float[] Samples = new float[0];
+    }
+
+    /// <summary>What an emitter plays, and how. Without a clip it plays the samples that the client sends.</summary>
+    public sealed class NafirSource
+    {
+        public string Clip;
+        public NafirPose Pose;
+        public float GainDb;
+        public bool Loop = true;
+    }
+
+    public static class NafirWire
+    {
+        public const int Protocol = 3;
+        const int AudioHeader = 28, DryHeader = 12;
+        const float FullScale = 32767;
+
+        /// <summary>Reads a block of 16-bit samples into `block`, whose array is kept where it is long enough. Returns false for another
+        /// kind of message, which a client ignores, and for a damaged one.</summary>
+        public static bool TryParse(byte[] data, int size, NafirBlock block)
+        {
+            if (size < AudioHeader || data[0] != 1) return false;
+            int channels = data[2] | data[3] << 8;
+            long frames = UInt(data, 24);
+            if (channels == 0 || size - AudioHeader != 2 * channels * frames) return false;
+            block.Flags = data[1];
+            block.Channels = channels;
+            block.Sequence = UInt(data, 4);
+            block.SampleClock = UInt(data, 8) | (ulong)UInt(data, 12) << 32;
+            block.PoseId = UInt(data, 16);
+            block.ReverberationPoseId = UInt(data, 20);
+            block.Frames = (int)frames;
+            int count = channels * block.Frames;
+            if (block.Samples.Length < count) block.Samples = new float[count];
+            for (int i = 0, from = AudioHeader; i < count; i++, from += 2) block.Samples[i] = (short)(data[from] | data[from + 1] << 8) / FullScale;
+            return true;
+        }
+
+        /// <summary>The listener's pose. `poseId` rises over all poses of the stream, the listener's and the emitters'.</summary>
+        public static byte[] Listener(uint poseId, NafirPose pose)
+        {
+            var data = new byte[36];
+            data[0] = 2;
+            Put(data, 4, poseId);
+            var numbers = Numbers(pose);
+            for (int i = 0; i < numbers.Length; i++) Put(data, 8 + 4 * i, BitConverter.ToUInt32(BitConverter.GetBytes(numbers[i]), 0));
+            return data;
+        }
+
+        /// <summary>The next mono samples of a live emitter. `sequence` rises from block to block.</summary>
+        public static byte[] DryBlock(string id, uint sequence, float[] samples, int frames)
+        {
+            var name = Encoding.UTF8.GetBytes(id);
+            int start = DryHeader + (name.Length + 3) / 4 * 4;
+            var data = new byte[start + 2 * frames];
+            data[0] = 3;
+            data[1] = 1;
+            data[2] = (byte)name.Length;
+            data[3] = (byte)(name.Length >> 8);
+            Put(data, 4, sequence);
+            Put(data, 8, (uint)frames);
+            name.CopyTo(data, DryHeader);
+            for (int i = 0; i < frames; i++)
+            {
+                var sample = (short)Math.Round(Math.Max(-1, Math.Min(1, samples[i])) * FullScale);
+                data[start + 2 * i] = (byte)sample;
+                data[start + 2 * i + 1] = (byte)(sample >> 8);
+            }
+            return data;
+        }
+
+        /// <summary>The first message. A `sampleRate` of 0 takes the scene's own.</summary>
+        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener)
+        {
+            var rate = sampleRate > 0 ? $",\"sample_rate\":{sampleRate}" : "";
+            return $"{{\"type\":\"hello\",\"protocol\":{Protocol},\"scene\":{NafirJson.Quote(scene)},\"block_size\":{blockSize},\"encoding\":\"s16\","
+                + $"\"buffer_blocks\":{bufferBlocks},\"listener\":{{{Text(listener)}}}{rate}}}";
+        }
+
+        public static string AddEmitter(string id, NafirSource source)
+        {
+            var sound = source.Clip == null ? "\"live\":true" : $"\"clip\":{NafirJson.Quote(source.Clip)},\"loop\":{(source.Loop ? "true" : "false")}";
+            return $"{{\"type\":\"add_emitter\",\"id\":{NafirJson.Quote(id)},{sound},\"gain_db\":{Text(source.GainDb)},{Text(source.Pose)}}}";
+        }
+
+        public static string MoveEmitter(string id, uint poseId, NafirPose pose) =>
+            $"{{\"type\":\"move_emitter\",\"id\":{NafirJson.Quote(id)},\"pose_id\":{poseId},{Text(pose)}}}";
+
+        public static string SetGain(string id, float gainDb) =>
+            $"{{\"type\":\"set_gain\",\"id\":{NafirJson.Quote(id)},\"gain_db\":{Text(gainDb)}}}";
+
+        public static string RemoveEmitter(string id) => $"{{\"type\":\"remove_emitter\",\"id\":{NafirJson.Quote(id)}}}";
+
+        /// <summary>Every block up to `sequence` has arrived. Without it the server soon stops sending.</summary>
+        public static string Acknowledge(uint sequence) => $"{{\"type\":\"acknowledge\",\"sequence\":{sequence}}}";
+
+        static float[] Numbers(NafirPose pose)
+        {
+            var p = pose.Position;
+            var q = pose.Orientation;
+            return new[] { p.X, p.Y, p.Z, q.X, q.Y, q.Z, q.W };
+        }
+
+        static string Text(NafirPose pose)
+        {
+            var texts = Array.ConvertAll(Numbers(pose), Text);
+            return $"\"position\":[{string.Join(",", texts, 0, 3)}],\"orientation\":[{string.Join(",", texts, 3, 4)}]";
+        }
+
+        // With a point whatever the language of the system.
+        static string Text(float value) => value.ToString("R", CultureInfo.InvariantCulture);
+
+        static uint UInt(byte[] data, int at) => data[at] | (uint)data[at + 1] << 8 | (uint)data[at + 2] << 16 | (uint)data[at + 3] << 24;
+
+        static void Put(byte[] data, int at, uint value)
+        {
+            for (int i = 0; i < 4; i++) data[at + i] = (byte)(value >> (8 * i));
+        }
+    }
+}
