@@ -34,6 +34,8 @@ FUZZ_SECONDS ?= 60
 # Folders with tests that watch the clock: collecting the others takes as long as many a test.
 TIMED := $(addprefix tests/,api bench integration runtime streaming)
 VENV := .venv
+# The Python package for clients, with a project file of its own.
+CLIENT := client_examples/python
 BIN := $(VENV)/bin
 # The server alone is installed by uv, in a quarter of the time, or by pip where uv or its packages cannot be
 # had. Its bytecode is compiled by the first start, which needs a third of the modules.
@@ -236,23 +238,23 @@ $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Nafir needs Python 3.11 or newer: make PYTHON=python3.x")'
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/installed-server: pyproject.toml | $(BIN)/python
+$(VENV)/installed-server: pyproject.toml $(CLIENT)/pyproject.toml | $(BIN)/python
 	@echo "Installing the server into $(VENV), once ..."
-	@{ $(PIP) uv && $(UV) --editable .; } 2>/dev/null || $(PIP) --editable .
+	@{ $(PIP) uv && $(UV) --editable . --editable $(CLIENT); } 2>/dev/null || $(PIP) --editable . --editable $(CLIENT)
 	@touch $@
 
 # torch first and alone, so that no other requirement chooses a different build of it.
 $(VENV)/installed-training: pyproject.toml | $(BIN)/python
 	@echo "Installing the training side into $(VENV), once ..."
 	$(PIP) torch==2.13.0
-	$(PIP) --editable '.[training]'
+	$(PIP) --editable '.[training]' --editable $(CLIENT)
 	@$(BYTECODE)
 	@touch $(VENV)/installed-server $@
 
-$(VENV)/installed-dev: pyproject.toml | $(BIN)/python
+$(VENV)/installed-dev: pyproject.toml $(CLIENT)/pyproject.toml | $(BIN)/python
 	@echo "Installing what tests need into $(VENV), once ..."
 	$(PIP) torch==2.13.0
-	$(PIP) --editable '.[dev]'
+	$(PIP) --editable '.[dev]' --editable '$(CLIENT)[clips,play,record]'
 	@$(BYTECODE)
 	@touch $(VENV)/installed-server $(VENV)/installed-training $@
 

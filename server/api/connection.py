@@ -51,6 +51,7 @@ from server.protocol.client_messages import (
     RemoveEmitter,
     SetEffects,
     SetLevel,
+    emitter_of,
     parse_client_message,
 )
 from server.protocol.codecs.registry import Encoding
@@ -428,16 +429,18 @@ class Connection:
         while an earlier one is being handled."""
         if self._is_handling or self._stream is None:
             return False
+        message = None
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter):
                 return False
             self._pass_on(message, self._stream)
         except RequestError as refusal:
-            self._enqueue([Error.from_refusal(refusal)])
+            self._refuse(refusal, message)
         return True
 
     async def _handle(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
+        message = None
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
@@ -445,7 +448,11 @@ class Connection:
                 await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
             self._pass_on(message, stream)
         except RequestError as refusal:
-            self._enqueue([Error.from_refusal(refusal)])
+            self._refuse(refusal, message)
+
+    def _refuse(self, refusal: RequestError, message: ClientMessage | None) -> None:
+        """Tell the client that a message was refused; None stands for one that could not be read."""
+        self._enqueue([Error.from_refusal(refusal, None if message is None else emitter_of(message))])
 
     def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
         """Answer a ping, or put the message into the stream's inbox. Raises RequestError too_many_messages, or

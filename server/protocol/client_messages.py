@@ -297,6 +297,11 @@ _FIELDS: Final[Mapping[str, Iterable[str]]] = {
 _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
 
+def emitter_of(message: ClientMessage) -> str | None:
+    """The id of the emitter that a message is about; None if it is about none."""
+    return message.id if isinstance(message, AddEmitter | MoveEmitter | SetGain | RemoveEmitter | DryBlock) else None
+
+
 def parse_client_message(data: str | bytes) -> ClientMessage:
     """Read one message as it came from the socket, text or binary.
 

@@ -208,7 +208,8 @@ class Pong(Message):
 
 
 class Error(Message):
-    """Says what was wrong with a message. The stream goes on, unless the message was the hello.
+    """Says what was wrong with a message. The stream goes on, unless the message was the hello. `emitter` is the id of
+    the emitter that the message was about, if it was about one and could be read.
 
     What a server refuses because it has too much to do (`server_busy`) may be asked for again after `retry_after_s`
     seconds. `level` is the quality level at which a stream that insists on another would fit now, if there is one.
@@ -220,15 +221,17 @@ class Error(Message):
     field: str | None = None
     retry_after_s: Annotated[int | None, Field(exclude_if=lambda seconds: seconds is None)] = None
     level: Annotated[str | None, Field(exclude_if=lambda level: level is None)] = None
+    emitter: Annotated[str | None, Field(exclude_if=lambda emitter: emitter is None)] = None
 
     @classmethod
-    def from_refusal(cls, refusal: RequestError) -> Self:
+    def from_refusal(cls, refusal: RequestError, emitter: str | None = None) -> Self:
         return cls(
             code=refusal.code,
             message=str(refusal),
             field=refusal.field,
             retry_after_s=refusal.retry_after_s,
             level=refusal.level,
+            emitter=emitter,
         )
 
 

@@ -34,6 +34,7 @@ from server.protocol.client_messages import (
     RemoveEmitter,
     SetEffects,
     SetGain,
+    emitter_of,
 )
 from server.protocol.server_messages import EmitterRemoved, Error, LevelReason, LiveStatus, PlanChanged, ServerMessage
 from server.rendering.hrtf import HeadFilters
@@ -201,7 +202,7 @@ class Session:
                 case _:
                     raise RequestError(f"unexpected_{message.type}", f"{message.type} has no place in a running stream")
         except RequestError as refusal:
-            return [Error.from_refusal(refusal)]
+            return [Error.from_refusal(refusal, emitter_of(message))]
         return []
 
     @property
@@ -317,8 +318,8 @@ class Session:
 
     def complaints(self) -> list[ServerMessage]:
         """Return errors about live samples since the last call."""
-        refusals = [emitter.live.complaint() for emitter in self._emitters.values() if emitter.live]
-        return [Error.from_refusal(refusal) for refusal in refusals if refusal]
+        refusals = {name: emitter.live.complaint() for name, emitter in self._emitters.items() if emitter.live}
+        return [Error.from_refusal(refusal, name) for name, refusal in refusals.items() if refusal]
 
     def _follow(self, identifier: str, emitter: StreamedEmitter) -> None:
         if self._effects.planned is not None:

@@ -278,7 +278,7 @@ def test_every_bad_message_gets_its_code_and_the_stream_goes_on(ears):
 def test_a_clip_that_cannot_be_decoded_says_why(ears):
     ears.send(AddEmitter(id="x", clip="broken", position=(1.0, 2.0, 1.0)))
     error = ears.until(Error)
-    assert error.field == "clip"
+    assert (error.field, error.emitter) == ("clip", "x")
     assert "broken.wav" in error.message
     assert len(error.message) > len("broken.wav: ")
 

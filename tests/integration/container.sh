@@ -154,8 +154,11 @@ PYTHON
 
 say "walking through the scene for three seconds"
 # From inside, where what the client imports is installed; /dev/shm is the only place to write.
-run_podman exec --interactive "$container" python - --url "ws://127.0.0.1:$port/v1/stream" --scene "$scene" \
-    --seconds 3 -o /dev/shm/heard.wav <"$root/client_examples/python/walk.py"
+tar --create --directory "$root/client_examples/python" nafir_client walk.py |
+    run_podman exec --interactive "$container" python -c \
+        'import sys, tarfile; tarfile.open(fileobj=sys.stdin.buffer, mode="r|").extractall("/dev/shm", filter="data")'
+run_podman exec "$container" python /dev/shm/walk.py --url "ws://127.0.0.1:$port" --scene "$scene" \
+    --seconds 3 -o /dev/shm/heard.wav
 
 say "stopping it"
 started=$SECONDS

@@ -218,6 +218,9 @@ def test_a_full_window_drops_blocks_but_not_time(field, filters):
     np.testing.assert_array_equal(resumed.samples, expected.samples)
 
 
+ABOUT_EMITTERS = {"add_emitter", "move_emitter", "set_gain", "remove_emitter", "dry_block"}
+
+
 @pytest.mark.parametrize(
     ("message", "code"),
     [
@@ -243,7 +246,9 @@ def test_a_bad_message_changes_nothing_and_the_stream_goes_on(session, field, me
     add(session)
     answer(session, field)
     session.render_block()
-    assert codes(session.receive(message)) == [code]
+    refused = session.receive(message)
+    assert codes(refused) == [code]
+    assert refused[0].emitter == (message.id if message.type in ABOUT_EMITTERS else None)
     assert session.take_request() is None
     block = session.render_block()
     assert np.any(block.samples)

@@ -1,0 +1,48 @@
+"""Streams of a Nafir server, and its impulse responses, from Python.
+
+`connect` is for asyncio, `nafir_client.threaded.connect` for programs without it, such as games and audio callbacks.
+"""
+
+from nafir_client.backoff import Backoff
+from nafir_client.client import Client, ImpulseResponse
+from nafir_client.errors import (
+    ClipError,
+    ClosedError,
+    ConnectionLostError,
+    MissingExtraError,
+    NafirClientError,
+    ProtocolError,
+    RefusedError,
+    UnreachableError,
+)
+from nafir_client.pose import Pose
+from nafir_client.scene import Scene, Welcome
+from nafir_client.session import Message, StreamOptions
+from nafir_client.stream import Emitter, Stream, connect
+from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.wire import EFFECTS, Block
+
+__all__ = [
+    "EFFECTS",
+    "Backoff",
+    "Block",
+    "Client",
+    "ClipError",
+    "ClosedError",
+    "ConnectionLostError",
+    "Emitter",
+    "ImpulseResponse",
+    "Message",
+    "MissingExtraError",
+    "NafirClientError",
+    "Pose",
+    "ProtocolError",
+    "RefusedError",
+    "Scene",
+    "Stream",
+    "StreamOptions",
+    "StreamStatistics",
+    "UnreachableError",
+    "Welcome",
+    "connect",
+]

@@ -1,0 +1,130 @@
+"""Streams on disk: the sound as it arrived, and the path as it was heard."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nafir_client.errors import MissingExtraError
+from nafir_client.pose import Pose
+from nafir_client.session import Message
+from nafir_client.wire import Block, Samples
+
+Row = tuple[int, int, int | str, str]
+
+
+def write_wav(path: Path | str, samples: Samples, sample_rate: int) -> None:
+    """Write samples (frame, channel) or (frame,) as single precision. Raises MissingExtraError, and OSError where the
+    file cannot be written."""
+    try:
+        import soundfile
+    except ImportError as exc:
+        raise MissingExtraError("soundfile", "record", "writing sound files") from exc
+    try:
+        soundfile.write(path, samples, sample_rate, subtype="FLOAT")
+    except soundfile.LibsndfileError as exc:
+        raise OSError(f"{path}: {exc.error_string}") from exc
+
+
+class Recording:
+    """Blocks by their clock, with silence where blocks are missing. `start_clock` is the first sample to keep; blocks
+    that lie before it are not kept."""
+
+    def __init__(self, start_clock: int = 0) -> None:
+        self.start_clock = start_clock
+        self._blocks: dict[int, Samples] = {}
+
+    def add(self, block: Block) -> None:
+        if block.sample_clock >= self.start_clock:
+            self._blocks[block.sample_clock] = block.samples
+
+    @property
+    def frames(self) -> int:
+        """Samples of each channel from the start to the end of the last block."""
+        if not self._blocks:
+            return 0
+        last = next(reversed(self._blocks))
+        return last + len(self._blocks[last]) - self.start_clock
+
+    def samples(self, frames: int | None = None) -> Samples:
+        """(frame, channel) all of them, or the first `frames`."""
+        frames = self.frames if frames is None else frames
+        channels = next(iter(self._blocks.values())).shape[1] if self._blocks else 2
+        samples = np.zeros((frames, channels), np.float32)
+        for clock, block in self._blocks.items():
+            at = clock - self.start_clock
+            samples[at : at + len(block)] = block[: max(0, frames - at)]
+        return samples
+
+
+class PathAsHeard:
+    """From which sample on each pose and each quality level was heard.
+
+    `nafir render --path` makes the same sound from the file that `write` makes. Poses have to be noted by their ids
+    before blocks name them.
+    """
+
+    def __init__(self, level: str) -> None:
+        self._poses: dict[int, Pose] = {}
+        self._levels = {0: level}
+        """Quality level by its first sample."""
+        self._direct: dict[int, int] = {}
+        """First sample of the direct sound by pose id."""
+        self._reverberation: dict[int, int] = {}
+        """Pose id by the first sample of its reverberation."""
+
+    def note_pose(self, pose_id: int, pose: Pose) -> None:
+        self._poses[pose_id] = pose
+
+    def note_message(self, message: Message) -> None:
+        if message["type"] == "level_changed" and message["level"] != next(reversed(self._levels.values())):
+            self._levels[message["sample_clock"]] = message["level"]
+
+    def note_block(self, block: Block) -> None:
+        self._direct.setdefault(block.pose_id, block.sample_clock)
+        if block.reverberation_pose_id != next(reversed(self._reverberation.values()), None):
+            self._reverberation[block.sample_clock] = block.reverberation_pose_id
+
+    def rows(self) -> list[Row]:
+        """Pose id, sample of the direct sound, and sample and level of the reverberation (or empty), in rising order.
+
+        A pose whose reverberation was heard at two levels has two rows.
+        """
+        heard: dict[int, list[tuple[int, str]]] = {}
+        pose, level = None, ""
+        for sample in sorted(self._reverberation.keys() | self._levels.keys()):
+            pose, level = self._reverberation.get(sample, pose), self._levels.get(sample, level)
+            if pose is not None:
+                heard.setdefault(pose, []).append((sample, level))
+        rows: list[Row] = []
+        for pose in sorted(self._direct.keys() | heard.keys()):
+            # A pose that a newer one replaced within a block was never heard directly. It gets the sample of the newer
+            # one, whose row comes later and counts.
+            sample = self._direct.get(pose, min(at for newer, at in self._direct.items() if newer >= pose))
+            reverberation: list[tuple[int | str, str]] = [*heard.get(pose, [("", "")])]
+            rows += [(pose, sample, *each) for each in reverberation]
+        return rows
+
+    def write(self, path: Path | str) -> int:
+        """Write a CSV file. Returns how many rows it has."""
+        rows = self.rows()
+        with Path(path).open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["sample", "reverberation_sample", "level", "x", "y", "z", "qx", "qy", "qz", "qw"])
+            for pose_id, *clocks in rows:
+                pose = self._poses[pose_id]
+                writer.writerow([*clocks, *pose.position, *pose.orientation])
+        return len(rows)
+
+
+def level_sentence(change: Message, sample_rate: int) -> str:
+    """What a `level_changed` says."""
+    at_s, rate_hz = change["sample_clock"] / sample_rate, change["ir_rate_hz"]
+    pace = "with every pose" if rate_hz is None else f"at most {rate_hz:g} times a second"
+    reasons: Mapping[str, str] = {
+        "chosen": "as chosen",
+        "load": "the server is under load",
+        "recovered": "the server has recovered",
+    }
+    return f"{at_s:.2f} s: level {change['level']}, responses {pace}: {reasons.get(change['reason'], change['reason'])}"

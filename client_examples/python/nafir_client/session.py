@@ -1,0 +1,297 @@
+"""The client's side of a stream, without input and output: messages in, messages and blocks out.
+
+A session outlives its connections. It knows what the stream should be (listener, emitters, level, effects), so that a
+new connection can be made to be what the last one was. The clock goes on over connections: sample clocks are those of
+the session, not of the server.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, TypedDict
+
+from nafir_client.errors import ProtocolError, RefusedError
+from nafir_client.live_input import LiveInput
+from nafir_client.outbox import Outbox
+from nafir_client.pose import Orientation, Pose, Position
+from nafir_client.scene import Welcome
+from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.wire import (
+    BLOCK_KIND,
+    PROTOCOL,
+    Block,
+    Encoding,
+    Samples,
+    dry_bytes,
+    parse_block,
+    pose_bytes,
+)
+
+Message = Mapping[str, Any]
+"""A text message of the server. Its `type` says which fields it has."""
+_ACKNOWLEDGE_EVERY = 4
+_REFUSALS_OF_FORM = frozenset({"malformed_message", "malformed_pose", "malformed_directivity", "message_too_large"})
+"""Errors about messages that the server could not read, so that it cannot say which emitter they were about."""
+
+
+class StreamOptions(TypedDict, total=False):
+    """What may be said of a stream when it is opened; the server's reference has the meaning of each.
+
+    `listener` is the pose with which it begins. `emitters` is how many emitters are to come. `level` is a quality level
+    or `auto`. `order` is that of the output `ambisonics`. `effects` switches effects on or off.
+    """
+
+    sample_rate: int
+    block_size: Literal[128, 256, 512, 1024]
+    encoding: Encoding
+    buffer_blocks: int
+    output: Literal["headphones", "mono", "ambisonics"]
+    order: Literal[1, 2, 3]
+    hrtf: str
+    level: str
+    effects: Mapping[str, bool]
+    emitters: int
+    listener: Pose
+
+
+class SessionEmitter:
+    """An emitter as it should be: the fields of its `add_emitter`, kept up to date."""
+
+    def __init__(self, fields: dict[str, Any], live: LiveInput | None) -> None:
+        self.id: str = fields["id"]
+        self.fields = fields
+        self.live = live
+        self.is_heard = False
+        """Whether the server of the present connection has said that it is heard."""
+        self.start_clock = 0
+        """The clock from which on it is heard, or was in the last connection."""
+
+
+class Session:
+    """The state of one stream. Every method that has something to send puts it into `outbox`."""
+
+    def __init__(self, scene: str, options: StreamOptions) -> None:
+        given: dict[str, Any] = {"block_size": 256, "encoding": "f32", "level": "auto", **options}
+        self.listener: Pose | None = given.pop("listener", None)
+        self._hello = {"type": "hello", "protocol": PROTOCOL, "scene": scene, **given}
+        self.outbox = Outbox()
+        self.emitters: dict[str, SessionEmitter] = {}
+        self.statistics = StreamStatistics()
+        self.welcome: Welcome | None = None
+        self.level = ""
+        self.next_clock = 0
+        """The clock of the frame after the newest block."""
+        self.last_error: RefusedError | None = None
+        """The newest error of this connection."""
+        self._arrived_s = 0.0
+        self._clock_offset = 0
+        """What is added to the server's clock."""
+        self._next_pose_id = 1
+        self._pings: dict[int, float] = {}
+        self._ping_id = 0
+
+    def hello(self) -> str:
+        """The first message of a connection. What the stream had before is asked for next."""
+        self.outbox.clear()
+        for emitter in self.emitters.values():
+            self._add(emitter)
+        hello = dict(self._hello)
+        if self.listener is not None:
+            hello["listener"] = {"position": self.listener.position, "orientation": self.listener.orientation}
+        if self.emitters:
+            hello["emitters"] = max(hello.get("emitters", 0), len(self.emitters))
+        return json.dumps(hello)
+
+    def greet(self, data: str | bytes, now_s: float) -> Welcome:
+        """Take the answer to a hello. Raises RefusedError or ProtocolError."""
+        answer = _read(data) if isinstance(data, str) else {"type": "a block"}
+        if answer["type"] == "error":
+            raise refusal(answer)
+        if answer["type"] != "welcome":
+            raise ProtocolError(f"the server answers a hello with {answer['type']}")
+        is_first, self.welcome = self.welcome is None, Welcome.read(answer)
+        self.level = self.welcome.level
+        self.last_error = None
+        self._pings.clear()
+        if not is_first:
+            self._clock_offset = self._continued(self.welcome, now_s)
+        return self.welcome
+
+    def disconnect(self) -> None:
+        """The connection is lost, and what was on its way."""
+        self.statistics.pose_to_sound.forget()
+        self.statistics.pose_to_reverberation.forget()
+        for emitter in self.emitters.values():
+            emitter.is_heard = False
+            if emitter.live:
+                emitter.live.close()
+
+    def receive(self, data: str | bytes, now_s: float) -> Block | Message | None:
+        """Take a message of the server. Returns None for kinds of binary messages that are not known. Raises
+        ProtocolError."""
+        if isinstance(data, str):
+            return self._receive_message(_read(data), now_s)
+        return self._receive_block(data, now_s) if data[:1] == bytes([BLOCK_KIND]) else None
+
+    def move_listener(self, pose: Pose, now_s: float) -> int:
+        """Returns the pose id, which blocks name once they are heard from there."""
+        self.listener = pose
+        pose_id = self._new_pose(now_s)
+        self.outbox.put(pose_bytes(pose, pose_id), "listener")
+        return pose_id
+
+    def add_emitter(self, fields: dict[str, Any], live: LiveInput | None) -> SessionEmitter:
+        """Raises RefusedError duplicate_emitter."""
+        if fields["id"] in self.emitters:
+            raise RefusedError("duplicate_emitter", f"emitter {fields['id']!r} is already there", field="id")
+        emitter = self.emitters[fields["id"]] = SessionEmitter(fields, live)
+        self._add(emitter)
+        return emitter
+
+    def move_emitter(
+        self, emitter: SessionEmitter, position: Position, orientation: Orientation | None, now_s: float
+    ) -> int:
+        """Without an orientation its front keeps its direction. Returns the pose id."""
+        moved: dict[str, Any] = {"position": position}
+        if orientation is not None:
+            emitter.fields.pop("yaw", None)
+            moved["orientation"] = orientation
+        emitter.fields.update(moved)
+        pose_id = self._new_pose(now_s)
+        self._put({"type": "move_emitter", "id": emitter.id, "pose_id": pose_id, **moved}, ("move", emitter.id))
+        return pose_id
+
+    def set_gain(self, emitter: SessionEmitter, gain_db: float) -> None:
+        emitter.fields["gain_db"] = gain_db
+        self._put({"type": "set_gain", "id": emitter.id, "gain_db": gain_db}, ("gain", emitter.id))
+
+    def remove_emitter(self, emitter: SessionEmitter) -> None:
+        if self.emitters.pop(emitter.id, None) is not None:
+            self._put({"type": "remove_emitter", "id": emitter.id})
+
+    def forget_emitter(self, emitter: SessionEmitter) -> None:
+        """The server has refused it."""
+        self.emitters.pop(emitter.id, None)
+
+    def set_level(self, level: str) -> None:
+        self._hello["level"] = level
+        self._put({"type": "set_level", "level": level})
+
+    def set_effects(self, effects: Mapping[str, bool | None], output: str | None) -> None:
+        wished = {**self._hello.get("effects", {}), **effects}
+        self._hello["effects"] = {name: is_on for name, is_on in wished.items() if is_on is not None}
+        message: dict[str, Any] = {"type": "set_effects", "effects": dict(effects)}
+        if output is not None:
+            self._hello["output"] = message["output"] = output
+        self._put(message)
+
+    def ping(self, now_s: float) -> None:
+        """Ask for a pong, which measures the round trip."""
+        self._ping_id += 1
+        self._pings = {self._ping_id: now_s}
+        self._put({"type": "ping", "id": self._ping_id}, "ping")
+
+    def pump(self) -> None:
+        """Send what live emitters have and the server should."""
+        for emitter in self.emitters.values():
+            if emitter.live:
+                for samples in emitter.live.due():
+                    self._put_dry(emitter, emitter.live, samples)
+
+    def _put_dry(self, emitter: SessionEmitter, live: LiveInput, samples: Samples) -> None:
+        encoding: Encoding = "s16" if self._hello["encoding"] == "s16" else "f32"
+        self.outbox.put(dry_bytes(emitter.id, live.sequence, samples, encoding))
+        live.sequence += 1
+
+    def _add(self, emitter: SessionEmitter) -> None:
+        self._put({"type": "add_emitter", **emitter.fields})
+
+    def _put(self, message: Mapping[str, Any], key: object = None) -> None:
+        self.outbox.put(json.dumps(message), key)
+
+    def _new_pose(self, now_s: float) -> int:
+        pose_id, self._next_pose_id = self._next_pose_id, self._next_pose_id + 1
+        self.statistics.pose_to_sound.send(pose_id, now_s)
+        self.statistics.pose_to_reverberation.send(pose_id, now_s)
+        return pose_id
+
+    def _receive_block(self, data: bytes, now_s: float) -> Block:
+        welcome, counts = self.welcome, self.statistics
+        assert welcome is not None
+        block = parse_block(data, welcome.encoding, now_s, self._clock_offset)
+        frames = block.sample_clock + block.frames - self.next_clock
+        counts.blocks += 1
+        counts.blocks_late += block.is_late
+        counts.blocks_limited += block.is_limited
+        counts.blocks_skipped += (block.sample_clock - self.next_clock) // block.frames
+        counts.pose_to_sound.receive(block.pose_id, now_s)
+        counts.pose_to_reverberation.receive(block.reverberation_pose_id, now_s)
+        self.next_clock = block.sample_clock + block.frames
+        self._arrived_s = now_s
+        if block.sequence % _ACKNOWLEDGE_EVERY == _ACKNOWLEDGE_EVERY - 1:
+            self._put({"type": "acknowledge", "sequence": block.sequence}, "acknowledge")
+        for emitter in self.emitters.values():
+            if emitter.live:
+                emitter.live.advance(frames)
+        self.pump()
+        return block
+
+    def _continued(self, welcome: Welcome, now_s: float) -> int:
+        """The clock at which a new stream of the server's begins: as much later as the connection was away. The last
+        block was to be played `buffer_blocks` after it arrived."""
+        block_size = welcome.block_size
+        away = (now_s - self._arrived_s) * welcome.sample_rate - welcome.buffer_blocks * block_size
+        return self.next_clock + block_size * max(0, math.ceil(away / block_size))
+
+    def _receive_message(self, message: dict[str, Any], now_s: float) -> Message:
+        if "sample_clock" in message:
+            message["sample_clock"] += self._clock_offset
+        match message:
+            case {"type": "emitter_added", "id": identifier, "sample_clock": clock} if identifier in self.emitters:
+                emitter = self.emitters[identifier]
+                emitter.is_heard, emitter.start_clock = True, clock
+                if emitter.live:
+                    emitter.live.open()
+                    self.pump()
+            case {"type": "level_changed", "level": level}:
+                self.level = level
+            case {"type": "status", "live": live}:
+                self._correct(live)
+            case {"type": "pong", "id": identifier} if identifier in self._pings:
+                self.statistics.round_trip.add(now_s - self._pings.pop(identifier))
+            case {"type": "error"}:
+                self.last_error = refusal(message)
+        return message
+
+    def _correct(self, live: Iterable[Mapping[str, Any]]) -> None:
+        for each in live:
+            emitter = self.emitters.get(each["id"])
+            if emitter is not None and emitter.live:
+                emitter.live.correct(each["samples_queued"])
+
+    def refused_emitter(self, error: RefusedError) -> SessionEmitter | None:
+        """The emitter that was not added because of an error; None if the error was about something else."""
+        if error.emitter is not None:
+            emitter = self.emitters.get(error.emitter)
+            return None if emitter is None or emitter.is_heard else emitter
+        if error.code not in _REFUSALS_OF_FORM:
+            return None
+        return next((each for each in self.emitters.values() if not each.is_heard), None)
+
+
+def refusal(message: Message) -> RefusedError:
+    """The error that a message tells of."""
+    names = "field", "emitter", "retry_after_s", "level"
+    return RefusedError(
+        str(message.get("code", "")), str(message.get("message", "")), **{name: message.get(name) for name in names}
+    )
+
+
+def _read(data: str) -> dict[str, Any]:
+    try:
+        message = json.loads(data)
+    except ValueError as exc:
+        raise ProtocolError("a message of the server is no JSON") from exc
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise ProtocolError("a message of the server has no type")
+    return message

@@ -1,0 +1,502 @@
+"""A stream in asyncio: `async with connect(URL, scene=...) as stream`.
+
+One task reads from the socket and makes the connection anew when it is lost; another writes. What a stream has to say
+waits in the outbox of its session, where newer poses take the place of older ones. Blocks wait to be taken; if they are
+not, the oldest are dropped and counted.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import random
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from types import TracebackType
+from typing import Any, Self, TypeVar, Unpack
+
+import numpy as np
+import numpy.typing as npt
+from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.client import connect as connect_socket
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+
+from nafir_client.address import stream_url
+from nafir_client.backoff import Backoff
+from nafir_client.client import refused
+from nafir_client.errors import (
+    ClosedError,
+    ConnectionLostError,
+    NafirClientError,
+    RefusedError,
+    UnreachableError,
+)
+from nafir_client.live_input import LiveInput
+from nafir_client.pose import Pose, Position
+from nafir_client.scene import Scene, Welcome
+from nafir_client.session import Message, Session, SessionEmitter, StreamOptions, refusal
+from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.wire import Block
+
+T = TypeVar("T")
+_OPEN_S = 10.0
+_WELCOME_S = 30.0
+"""How long the server may take to answer a hello: it may measure what ambisonics of a scene cost first."""
+_PING_EVERY_S = 1.0
+_SILENCE_S = 6.0
+"""A connection over which no answer to a ping came for so long is lost."""
+_KEPT_S = 4.0
+"""Blocks of this much time may wait to be taken."""
+_MOST_WAITING = 1_000
+"""Messages that may wait to be sent before callers have to wait."""
+_LIVE_S = 1.0
+"""Samples of this much time may wait in a live emitter."""
+
+
+def connect(
+    url: str,
+    *,
+    scene: str,
+    api_key: str | None = None,
+    reconnect: Backoff | None = Backoff(),  # noqa: B008  frozen
+    patience_s: float = 0.0,
+    on_message: Callable[[Message], None] | None = None,
+    **options: Unpack[StreamOptions],
+) -> "Stream":
+    """A stream of a scene, which opens in `async with`.
+
+    `url` is the server's, such as `ws://127.0.0.1:8000`. `reconnect` says how a lost connection is made anew; with None
+    it ends the stream. For `patience_s` seconds the first connection is tried again, too, if the server is not there or
+    is busy. `on_message` gets every text message of the server in its order among blocks: it has to be quick. Other
+    `options` are those of the stream.
+    """
+    return Stream(
+        url,
+        Session(scene, options),
+        api_key=api_key,
+        reconnect=reconnect,
+        patience_s=patience_s,
+        on_message=on_message,
+    )
+
+
+class Emitter:
+    """A source of sound in a stream. `Stream.add_emitter` makes it."""
+
+    def __init__(self, stream: "Stream", state: SessionEmitter) -> None:
+        self._stream = stream
+        self._state = state
+
+    @property
+    def id(self) -> str:
+        return self._state.id
+
+    @property
+    def start_clock(self) -> int:
+        """The clock from which on it is heard, in the present connection."""
+        return self._state.start_clock
+
+    @property
+    def samples_dropped(self) -> int:
+        """Live samples that came faster than the server plays them."""
+        return 0 if self._state.live is None else self._state.live.dropped
+
+    async def move(
+        self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
+    ) -> int:
+        """Move it; without yaw and orientation its front keeps its direction. Returns the pose's id."""
+        return await self._stream.move_emitter(self._state, position, yaw=yaw, orientation=orientation)
+
+    async def set_gain(self, gain_db: float) -> None:
+        await self._stream.change(lambda session: session.set_gain(self._state, gain_db))
+
+    async def remove(self) -> None:
+        await self._stream.change(lambda session: session.remove_emitter(self._state))
+
+    async def write(self, samples: npt.ArrayLike) -> None:
+        """Play samples (n,) at the stream's rate, full scale 1, any number at once; waits while enough of them wait.
+
+        Raises ValueError if the emitter is not live.
+        """
+        await self._stream.write(self._state, samples)
+
+    def offer(self, samples: npt.ArrayLike) -> None:
+        """The same without waiting, as a microphone needs it: beyond a second the oldest samples are dropped."""
+        self._stream.offer(self._state, samples)
+
+
+class Stream:
+    """One listener in one scene, for as long as it is open. Iterating takes its blocks."""
+
+    def __init__(
+        self,
+        url: str,
+        session: Session,
+        *,
+        api_key: str | None,
+        reconnect: Backoff | None,
+        patience_s: float,
+        on_message: Callable[[Message], None] | None,
+    ) -> None:
+        self.url = url
+        self._address = stream_url(url)
+        self._session = session
+        self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._backoff = reconnect
+        self._patience_s = patience_s
+        self._on_message = on_message
+        self._blocks: deque[Block] = deque()
+        self._has_news = asyncio.Event()
+        self._has_outgoing = asyncio.Event()
+        self._has_room = asyncio.Event()
+        self._adding: dict[str, asyncio.Future[None]] = {}
+        self._numbers = itertools.count(1)
+        self._task: asyncio.Task[None] | None = None
+        self._failure: NafirClientError | None = None
+        self._is_closed = False
+        self.is_connected = False
+
+    async def __aenter__(self) -> Self:
+        started_s = time.monotonic()
+        socket = await self._connect_again(Backoff(give_up_after_s=self._patience_s), started_s, None)
+        self._task = asyncio.create_task(self._run(socket))
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End the stream. Blocks that have arrived can still be taken."""
+        self._is_closed = True
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+        self._end(ClosedError("the stream is closed"))
+
+    @property
+    def welcome(self) -> Welcome:
+        """What the server has agreed to. Raises ClosedError before the stream is open."""
+        if self._session.welcome is None:
+            raise ClosedError("the stream is not open yet")
+        return self._session.welcome
+
+    @property
+    def scene(self) -> Scene:
+        return self.welcome.scene
+
+    @property
+    def sample_rate(self) -> int:
+        return self.welcome.sample_rate
+
+    @property
+    def block_size(self) -> int:
+        return self.welcome.block_size
+
+    @property
+    def channels(self) -> int:
+        return self.welcome.channels
+
+    @property
+    def level(self) -> str:
+        """The present quality level."""
+        return self._session.level
+
+    @property
+    def sample_clock(self) -> int:
+        """The clock of the frame after the newest block."""
+        return self._session.next_clock
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        return self._session.statistics
+
+    def __aiter__(self) -> AsyncIterator[Block]:
+        return self
+
+    async def __anext__(self) -> Block:
+        """The oldest block that has not been taken. Waits while a lost connection is made anew. Raises
+        NafirClientError if that is given up."""
+        while not self._blocks:
+            if self._is_closed:
+                raise StopAsyncIteration
+            if self._failure is not None:
+                raise self._failure
+            self._has_news.clear()
+            await self._has_news.wait()
+        return self._blocks.popleft()
+
+    async def move_listener(
+        self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
+    ) -> int:
+        """Move the listener: metres, and a yaw in radians or a quaternion. Returns the pose's id, which blocks name
+        once the listener hears from there. Raises ValueError for numbers that are no pose."""
+        pose = Pose.of(position, yaw=yaw, orientation=orientation)
+        return await self.change(lambda session: session.move_listener(pose, time.monotonic()))
+
+    async def add_emitter(
+        self,
+        *,
+        clip: str | None = None,
+        position: Iterable[float] | None = None,
+        yaw: float | None = None,
+        orientation: Iterable[float] | None = None,
+        gain_db: float = 0.0,
+        loop: bool = True,
+        directivity: Mapping[str, Any] | None = None,
+        id: str | None = None,  # noqa: A002  the field's name
+        ahead_blocks: int = 4,
+    ) -> Emitter:
+        """Add an emitter and return once it is heard. Without a clip it is live: it plays what is written to it, of
+        which `ahead_blocks` are kept waiting at the server. Without a position it is where the scene suggests.
+
+        Raises RefusedError, or another NafirClientError if the stream ends first.
+        """
+        identifier = id if id is not None else self._free_id()
+        pose = Pose.of(self.scene.emitter.position if position is None else position, yaw=yaw, orientation=orientation)
+        fields: dict[str, Any] = {"id": identifier, "position": pose.position, "gain_db": gain_db}
+        if yaw is not None or orientation is not None:
+            fields["orientation"] = pose.orientation
+        if directivity is not None:
+            fields["directivity"] = dict(directivity)
+        fields.update({"live": True} if clip is None else {"clip": clip, "loop": loop})
+        block_size = self.block_size
+        live = None
+        if clip is None:
+            ahead = ahead_blocks * block_size
+            live = LiveInput(block_size, ahead=ahead, longest=ahead + round(_LIVE_S * self.sample_rate))
+        added = asyncio.get_running_loop().create_future()
+        state = await self.change(lambda session: session.add_emitter(fields, live))
+        self._adding[identifier] = added
+        try:
+            await added
+        except BaseException:
+            self._session.remove_emitter(state)
+            self._has_outgoing.set()
+            raise
+        finally:
+            self._adding.pop(identifier, None)
+        return Emitter(self, state)
+
+    async def set_level(self, level: str) -> None:
+        """Choose a quality level, or `auto`. A `level_changed` says from when on it is heard."""
+        await self.change(lambda session: session.set_level(level))
+
+    async def set_effects(self, effects: Mapping[str, bool | None], *, output: str | None = None) -> None:
+        """Switch effects on or off; None leaves one to the server's plan. `output` is `headphones` or `mono`."""
+        await self.change(lambda session: session.set_effects(effects, output))
+
+    async def move_emitter(
+        self,
+        state: SessionEmitter,
+        position: Iterable[float],
+        *,
+        yaw: float | None = None,
+        orientation: Iterable[float] | None = None,
+    ) -> int:
+        pose = Pose.of(position, yaw=yaw, orientation=orientation)
+        turned = None if yaw is None and orientation is None else pose.orientation
+        place: Position = pose.position
+        return await self.change(lambda session: session.move_emitter(state, place, turned, time.monotonic()))
+
+    async def write(self, state: SessionEmitter, samples: npt.ArrayLike) -> None:
+        live, left = _live(state), _mono(samples)
+        # A block at a time makes the wait short, whatever is written at once.
+        while len(left):
+            while live.waiting >= self.block_size:
+                self._require_open()
+                self._has_room.clear()
+                await self._has_room.wait()
+            self._require_open()
+            live.write(left[: self.block_size])
+            left = left[self.block_size :]
+            self._pump()
+
+    def offer(self, state: SessionEmitter, samples: npt.ArrayLike) -> None:
+        _live(state).write(_mono(samples))
+        self._pump()
+
+    async def change(self, put: Callable[[Session], T]) -> T:
+        """Have the session say something. Waits while very much waits to be said."""
+        self._require_open()
+        while len(self._session.outbox) >= _MOST_WAITING:
+            self._has_room.clear()
+            await self._has_room.wait()
+            self._require_open()
+        done = put(self._session)
+        self._has_outgoing.set()
+        return done
+
+    def _free_id(self) -> str:
+        return next(name for number in self._numbers if (name := f"emitter-{number}") not in self._session.emitters)
+
+    async def _connect_again(
+        self, backoff: Backoff, started_s: float, lost: ConnectionLostError | None
+    ) -> ClientConnection:
+        """Connect, and try again as long as that may help. Raises what the last attempt met with."""
+        advised_s = None if lost is None else lost.retry_after_s
+        for attempt in itertools.count():
+            if lost is not None or attempt:
+                await asyncio.sleep(backoff.wait_s(attempt, advised_s, random.Random()))
+            try:
+                return await self._connect()
+            except (UnreachableError, ConnectionLostError, RefusedError) as exc:
+                advised_s = getattr(exc, "retry_after_s", None)
+                wait_s = backoff.wait_s(attempt + 1, advised_s, random.Random())
+                if not exc.is_passing or time.monotonic() + wait_s - started_s > backoff.give_up_after_s:
+                    raise
+        raise AssertionError
+
+    async def _connect(self) -> ClientConnection:
+        """A connection whose hello has been answered. Raises UnreachableError, ConnectionLostError or RefusedError."""
+        try:
+            # Without compression, which takes time and does not make audio smaller.
+            socket = await connect_socket(
+                self._address,
+                compression=None,
+                max_size=None,
+                additional_headers=self._headers,
+                open_timeout=_OPEN_S,
+                ping_interval=_SILENCE_S / 2,
+                ping_timeout=_SILENCE_S / 2,
+            )
+        except InvalidStatus as exc:
+            raise _turned_away(self.url, exc) from exc
+        except (OSError, WebSocketException) as exc:
+            raise UnreachableError(self.url, str(exc) or type(exc).__name__) from exc
+        try:
+            async with asyncio.timeout(_WELCOME_S):
+                await socket.send(self._session.hello())
+                self._session.greet(await socket.recv(), time.monotonic())
+        except ConnectionClosed as exc:
+            raise _lost(self.url, exc, None) from exc
+        except TimeoutError as exc:
+            await socket.close()
+            raise UnreachableError(self.url, f"no answer to the hello came within {_WELCOME_S:g} s") from exc
+        except NafirClientError:
+            await socket.close()
+            raise
+        self.is_connected = True
+        return socket
+
+    async def _run(self, socket: ClientConnection) -> None:
+        """Serve one connection after the other until the stream is closed or fails."""
+        try:
+            while True:
+                lost = await self._serve(socket)
+                self._session.disconnect()
+                if self._backoff is None or not lost.is_passing:
+                    raise lost
+                socket = await self._connect_again(self._backoff, time.monotonic(), lost)
+                self.statistics.reconnections += 1
+        except NafirClientError as exc:
+            self._end(exc)
+
+    async def _serve(self, socket: ClientConnection) -> ConnectionLostError:
+        """Read and write until the connection ends. Raises ProtocolError for what cannot be read."""
+        others = asyncio.create_task(self._send(socket)), asyncio.create_task(self._ping())
+        try:
+            while True:
+                self._receive(await socket.recv())
+        except ConnectionClosed as exc:
+            return _lost(self.url, exc, self._session.last_error)
+        finally:
+            self.is_connected = False
+            for task in others:
+                task.cancel()
+            await asyncio.gather(*others, return_exceptions=True)
+            await socket.close()
+
+    async def _send(self, socket: ClientConnection) -> None:
+        outbox = self._session.outbox
+        with contextlib.suppress(ConnectionClosed):  # which the reader sees too
+            while True:
+                while (message := outbox.take()) is not None:
+                    await socket.send(message)
+                self._has_room.set()
+                self._has_outgoing.clear()
+                await self._has_outgoing.wait()
+
+    async def _ping(self) -> None:
+        while True:
+            self._session.ping(time.monotonic())
+            self._has_outgoing.set()
+            await asyncio.sleep(_PING_EVERY_S)
+
+    def _receive(self, data: str | bytes) -> None:
+        received = self._session.receive(data, time.monotonic())
+        if isinstance(received, Block):
+            if len(self._blocks) * self.block_size >= _KEPT_S * self.sample_rate:
+                self._blocks.popleft()
+                self.statistics.blocks_dropped += 1
+            self._blocks.append(received)
+            self._has_news.set()
+        elif received is not None:
+            self._settle(received)
+            if self._on_message is not None:
+                self._on_message(received)
+        self._pump()
+
+    def _settle(self, message: Message) -> None:
+        """End the wait of whoever has added an emitter that is now heard, or refused."""
+        if message["type"] == "emitter_added":
+            added = self._adding.get(message["id"])
+            if added is not None and not added.done():
+                added.set_result(None)
+        elif message["type"] == "error":
+            error = refusal(message)
+            state = self._session.refused_emitter(error)
+            added = None if state is None else self._adding.get(state.id)
+            if state is not None and added is not None and not added.done():
+                self._session.forget_emitter(state)
+                added.set_exception(error)
+
+    def _pump(self) -> None:
+        self._session.pump()
+        self._has_outgoing.set()
+        self._has_room.set()
+
+    def _require_open(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _end(self, failure: NafirClientError) -> None:
+        if self._failure is None:
+            self._failure = failure
+        for added in self._adding.values():
+            if not added.done():
+                added.set_exception(self._failure)
+        for event in (self._has_news, self._has_room, self._has_outgoing):
+            event.set()
+
+
+def _live(state: SessionEmitter) -> LiveInput:
+    if state.live is None:
+        raise ValueError(f"emitter {state.id!r} plays a clip: only a live emitter takes samples")
+    return state.live
+
+
+def _mono(samples: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    mono = np.asarray(samples, np.float32)
+    if mono.ndim != 1:
+        raise ValueError(f"samples: a live emitter has one channel, so one axis, not {mono.ndim}")
+    return mono
+
+
+def _turned_away(url: str, exc: InvalidStatus) -> UnreachableError | RefusedError:
+    """The error for an answer that opens no WebSocket."""
+    response = exc.response
+    error = refused(url, response.status_code, bytes(response.body or b""), response.headers.get("Retry-After"))
+    # What the web server says where nothing of Nafir's is at the address.
+    if response.status_code == 404 or (isinstance(error, RefusedError) and error.code == "handshake_refused"):
+        return UnreachableError(url, str(exc), is_passing=False)
+    return error
+
+
+def _lost(url: str, exc: ConnectionClosed, error: RefusedError | None) -> ConnectionLostError:
+    """The end of a connection, with the advice of the error before it."""
+    code = None if exc.rcvd is None else exc.rcvd.code
+    advised_s = None if error is None else error.retry_after_s
+    return ConnectionLostError(url, str(exc) or "the connection is lost", close_code=code, retry_after_s=advised_s)

@@ -1,0 +1,84 @@
+"""What a client measures of its stream."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+_KEPT = 1_000
+"""Durations of which quantiles are made: the newest so many."""
+
+
+class Durations:
+    """The newest durations of a kind, in milliseconds."""
+
+    def __init__(self) -> None:
+        self._ms: deque[float] = deque(maxlen=_KEPT)
+
+    def __len__(self) -> int:
+        return len(self._ms)
+
+    def add(self, duration_s: float) -> None:
+        self._ms.append(1000 * duration_s)
+
+    def quantile_ms(self, share: float) -> float:
+        """NaN before the first."""
+        return float(np.quantile(list(self._ms), share)) if self._ms else math.nan
+
+    @property
+    def median_ms(self) -> float:
+        return self.quantile_ms(0.5)
+
+
+class PoseWaits:
+    """Durations from a pose to the first block that has it or a newer one."""
+
+    def __init__(self) -> None:
+        self.durations = Durations()
+        self._sent_s: dict[int, float] = {}
+
+    def send(self, pose_id: int, now_s: float) -> None:
+        self._sent_s[pose_id] = now_s
+        if len(self._sent_s) > _KEPT:
+            del self._sent_s[next(iter(self._sent_s))]
+
+    def receive(self, pose_id: int, now_s: float) -> None:
+        while self._sent_s and (oldest := next(iter(self._sent_s))) <= pose_id:
+            self.durations.add(now_s - self._sent_s.pop(oldest))
+
+    def forget(self) -> None:
+        """Poses on their way are lost with the connection."""
+        self._sent_s.clear()
+
+
+@dataclass
+class StreamStatistics:
+    """Counts since the stream began, over all its connections, and durations of late."""
+
+    blocks: int = 0
+    blocks_late: int = 0
+    """Blocks that the server sent too late."""
+    blocks_skipped: int = 0
+    """Blocks that the server left out while the client acknowledged nothing."""
+    blocks_dropped: int = 0
+    """Blocks that were not taken from the stream in time."""
+    blocks_limited: int = 0
+    underruns: int = 0
+    """How often a player found nothing to play."""
+    reconnections: int = 0
+    round_trip: Durations = field(default_factory=Durations)
+    pose_to_sound: PoseWaits = field(default_factory=PoseWaits)
+    """From a pose of the listener or an emitter to its direct sound."""
+    pose_to_reverberation: PoseWaits = field(default_factory=PoseWaits)
+
+    def summary(self) -> dict[str, float]:
+        """Everything as numbers: counts, and medians in milliseconds; NaN where nothing was measured."""
+        counts = "blocks", "blocks_late", "blocks_skipped", "blocks_dropped", "blocks_limited", "underruns"
+        return {
+            **{name: getattr(self, name) for name in counts},
+            "reconnections": self.reconnections,
+            "round_trip_ms": self.round_trip.median_ms,
+            "pose_to_sound_ms": self.pose_to_sound.durations.median_ms,
+            "pose_to_reverberation_ms": self.pose_to_reverberation.durations.median_ms,
+        }

@@ -1,0 +1,219 @@
+"""Parts of the Python client without a server: what waits to be sent, live samples, waits, what is heard of a path."""
+
+import json
+import random
+
+import numpy as np
+import pytest
+
+from nafir_client import Backoff, ProtocolError, RefusedError, UnreachableError
+from nafir_client.address import api_url, stream_url
+from nafir_client.ambisonics import Ears, harmonics, rotation
+from nafir_client.live_input import LiveInput
+from nafir_client.outbox import Outbox
+from nafir_client.recording import Recording
+from nafir_client.session import Session
+from nafir_client.stream_statistics import PoseWaits
+from nafir_client.wire import Block
+from server.acoustics.spherical_harmonics import even_directions, real_harmonics
+from server.acoustics.spherical_harmonics import rotation as server_rotation
+from server.protocol.blocks import AudioBlock
+from tests.clients.test_python_wire import WELCOME
+
+
+def drained(outbox):
+    messages = []
+    while (message := outbox.take()) is not None:
+        messages.append(message)
+    return messages
+
+
+def test_newer_poses_take_the_place_of_older_ones_and_keep_their_order():
+    outbox = Outbox()
+    for message, key in [("l1", "l"), ("a", None), ("e2", "e"), ("l3", "l"), ("b", None), ("e4", "e")]:
+        outbox.put(message, key)
+    assert drained(outbox) == ["a", "l3", "b", "e4"]
+
+
+@pytest.mark.parametrize("chunk", [1, 100, 256, 1_000])
+def test_live_samples_come_whole_in_order_and_a_few_blocks_ahead(chunk):
+    samples = np.arange(5_000, dtype=np.float32)
+    live, sent, at_server = LiveInput(256, ahead=1_024, longest=10_000), [], 0
+    live.open()
+    for start in range(0, len(samples), chunk):
+        live.write(samples[start : start + chunk])
+        blocks = live.due()
+        sent += blocks
+        at_server += sum(map(len, blocks))
+        assert all(len(block) <= 256 for block in blocks)
+        assert at_server < 1_024 + 256
+        while live.waiting >= 256:
+            live.advance(256)
+            at_server -= 256
+            blocks = live.due()
+            sent += blocks
+            at_server += sum(map(len, blocks))
+    while live.waiting:
+        live.advance(256)
+        sent += live.due()
+    np.testing.assert_array_equal(np.concatenate(sent), samples)
+
+
+def test_live_samples_that_come_too_fast_lose_the_oldest():
+    live = LiveInput(256, ahead=1_024, longest=2_000)
+    live.write(np.arange(3_000))
+    assert (live.waiting, live.dropped, live.room) == (2_000, 1_000, 0)
+    live.open()
+    assert live.due()[0][0] == 1_000
+
+
+def test_nothing_is_sent_before_the_emitter_is_heard_or_while_the_connection_is_lost():
+    live = LiveInput(256, ahead=1_024, longest=10_000)
+    live.write(np.ones(256))
+    assert live.due() == []
+    live.open()
+    assert len(live.due()) == 1
+    live.close()
+    live.write(np.ones(256))
+    assert live.due() == []
+
+
+def test_what_the_server_says_it_has_is_not_sent_again():
+    live = LiveInput(256, ahead=1_024, longest=10_000)
+    live.open()
+    live.correct(2_000)
+    live.write(np.ones(512))
+    assert live.due() == []
+    live.advance(1_500)
+    assert len(live.due()) == 2
+
+
+def test_waits_of_poses_end_with_the_first_block_that_has_them_or_newer_ones():
+    waits = PoseWaits()
+    for pose_id in range(1, 5):
+        waits.send(pose_id, 0.0)
+    waits.receive(0, 0.1)
+    assert len(waits.durations) == 0
+    waits.receive(3, 0.2)
+    waits.receive(4, 0.4)
+    assert len(waits.durations) == 4
+    assert waits.durations.quantile_ms(0.0) == pytest.approx(200)
+    assert waits.durations.quantile_ms(1.0) == pytest.approx(400)
+
+
+def test_waits_grow_up_to_a_bound_and_never_undercut_the_servers_advice():
+    backoff, chance = Backoff(first_s=0.1, longest_s=2.0), random.Random(1)
+    waits = [backoff.wait_s(attempt, None, chance) for attempt in range(50)]
+    assert 0.05 <= waits[0] <= 0.1
+    assert max(waits) <= 2.0
+    assert min(waits[10:]) >= 1.0
+    assert len(set(waits)) == 50
+    assert backoff.wait_s(0, 7.0, chance) >= 7.0
+
+
+@pytest.mark.parametrize(
+    ("given", "stream", "api"),
+    [
+        ("ws://a:8000", "ws://a:8000/v1/stream", "http://a:8000/v1"),
+        ("http://a:8000/", "ws://a:8000/v1/stream", "http://a:8000/v1"),
+        ("https://a/sound/", "wss://a/sound/v1/stream", "https://a/sound/v1"),
+        ("wss://a/v1/stream", "wss://a/v1/stream", "https://a/v1"),
+        ("ws://[::1]:8000", "ws://[::1]:8000/v1/stream", "http://[::1]:8000/v1"),
+    ],
+)
+def test_addresses_of_the_stream_and_of_http_follow_from_the_servers(given, stream, api):
+    assert (stream_url(given), api_url(given)) == (stream, api)
+
+
+@pytest.mark.parametrize("given", ["ftp://a", "127.0.0.1:8000", "ws://", "", "ws://[a"])
+def test_what_is_no_address_is_said(given):
+    with pytest.raises(UnreachableError, match="it has to begin like"):
+        stream_url(given)
+
+
+def block(clock, value=1.0):
+    return Block(0, clock, 0, 0, np.full((256, 2), value, np.float32), False, False, False, 0.0)
+
+
+def test_a_recording_has_silence_for_blocks_that_were_skipped():
+    recording = Recording(start_clock=256)
+    for clock in (0, 256, 1_024):
+        recording.add(block(clock, clock))
+    assert recording.frames == 1_024
+    np.testing.assert_array_equal(recording.samples()[::256, 0], [256, 0, 0, 1_024])
+    np.testing.assert_array_equal(recording.samples(300)[:, 1], [256.0] * 256 + [0.0] * 44)
+
+
+@pytest.fixture
+def session():
+    session = Session("flat", {})
+    session.greet(WELCOME, 0.0)
+    return session
+
+
+def wire_block(sequence, clock):
+    return AudioBlock(sequence, clock, 0, 0, np.zeros((2, 256), np.float32)).serialize("f32")
+
+
+def test_the_clock_goes_on_over_connections_by_the_time_between_them(session):
+    for number in range(100):
+        session.receive(wire_block(number, 256 * number), 5.0)
+    session.disconnect()
+    session.hello()
+    session.greet(WELCOME, 7.0)  # two seconds later, of which 8 blocks still waited to be played
+    first = session.receive(wire_block(0, 0), 7.1)
+    away = first.sample_clock - 25_600
+    assert away % 256 == 0
+    assert 0 <= away - (2 * 24_000 - 8 * 256) < 256
+    assert session.receive('{"type": "emitter_removed", "id": "a", "sample_clock": 0}', 7.2)["sample_clock"] == (
+        first.sample_clock
+    )
+    assert session.statistics.blocks_skipped == away // 256
+
+
+def test_a_connection_that_is_back_at_once_continues_where_the_last_one_ended(session):
+    session.receive(wire_block(0, 0), 5.0)
+    session.hello()
+    session.greet(WELCOME, 5.01)
+    assert session.receive(wire_block(0, 0), 5.02).sample_clock == 256
+
+
+def test_messages_and_blocks_of_a_newer_server_are_ignored(session):
+    assert session.receive(b"\x77something", 0.0) is None
+    assert session.receive('{"type": "levitated", "height_m": 2}', 0.0)["type"] == "levitated"
+
+
+@pytest.mark.parametrize("bad", ["{", "[]", "{}", '{"type": 1}'])
+def test_what_is_no_message_is_an_error_of_the_protocol(session, bad):
+    with pytest.raises(ProtocolError):
+        session.receive(bad, 0.0)
+
+
+def test_a_refused_hello_has_all_that_the_server_says():
+    error = {"type": "error", "code": "server_busy", "message": "full", "field": None, "retry_after_s": 3, "level": "a"}
+    with pytest.raises(RefusedError) as refused:
+        Session("flat", {}).greet(json.dumps(error), 0.0)
+    assert (refused.value.code, refused.value.message, refused.value.field) == ("server_busy", "full", None)
+    assert (refused.value.retry_after_s, refused.value.level, refused.value.is_passing) == (3, "a", True)
+    assert str(refused.value) == "server_busy: full"
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_rotations_and_harmonics_are_those_of_the_server(order):
+    directions = even_directions(30)
+    np.testing.assert_allclose(harmonics(directions, order), real_harmonics(directions, order), atol=1e-12)
+    quaternions = np.random.default_rng(1).standard_normal((8, 4))
+    for orientation in quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True):
+        np.testing.assert_allclose(rotation(orientation, order), server_rotation(orientation, order), atol=1e-12)
+
+
+def test_ears_hear_the_same_however_the_sound_is_cut_into_blocks():
+    rng = np.random.default_rng(2)
+    filters = rng.standard_normal((2, 4, 33))
+    ears = Ears(filters), Ears(filters)
+    sound, still = rng.standard_normal((1_024, 4)).astype(np.float32), (0.0, 0.0, 0.0, 1.0)
+    whole = ears[0].process(sound, still)
+    cut = [ears[1].process(sound[start : start + 128], still) for start in range(0, 1_024, 128)]
+    np.testing.assert_allclose(np.concatenate(cut), whole, atol=1e-5)
+    expected = sum(np.convolve(sound[:, channel], filters[0, channel]) for channel in range(4))[:1_024]
+    np.testing.assert_allclose(whole[:, 0], expected, atol=1e-4)
