@@ -196,7 +196,7 @@ def _prepare_decoders(host: StreamHost, duty_cycle: DutyCycle) -> None:
         for head in host.hrtfs.names:
             for order in sorted(orders):
                 try:
-                    HeadDecoder.of(host.hrtfs.filters(head, levels.default.sample_rate), order, rest=duty_cycle.rest)
+                    HeadDecoder.of(host.hrtfs.filters(head, levels.own_rate), order, rest=duty_cycle.rest)
                 except CancelledError:  # the server shuts down
                     return
 
@@ -227,11 +227,11 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
     for scene, levels in host.scenes.items():
         filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
         offer = host.offers[scene] = Offer(
-            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, _CALIBRATION_POSES)
+            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, poses=_CALIBRATION_POSES)
         )
+        host.render_costs[scene, levels.own_rate] = measure_rendering(levels, filters)
         if levels.knows_directions:
-            host.measure_ambisonics(scene, levels.with_directions(), _PAGE_ORDER)
-        host.render_costs[scene] = measure_rendering(levels, filters)
+            host.measure(scene, levels.with_directions(), _PAGE_ORDER)
         clips = clips_of[scene]
         hello = Hello(protocol=PROTOCOL, scene=scene)
         best, *_, cheapest = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)

@@ -60,13 +60,14 @@ def playable_clips(clips: ClipLibrary) -> list[Clip]:
 
 
 def describe_scene(levels: FieldsByLevel) -> SceneDescription:
-    field, manifest = levels.default, levels.bundle.manifest
+    field, manifest = levels.at_rate(None).default, levels.bundle.manifest
     start, plan = manifest.start, levels.bundle.floor_plan
     return SceneDescription(
         id=manifest.id,
         name=manifest.name,
         description=manifest.description,
         sample_rate=field.sample_rate,
+        sample_rates=levels.sample_rates,
         ir_samples=field.ir_samples,
         channels=manifest.channels,
         speed_of_sound=manifest.speed_of_sound,

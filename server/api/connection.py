@@ -15,6 +15,7 @@ to the task, and a session in that cycle would stay in memory until the garbage 
 import asyncio
 import contextlib
 import dataclasses
+import math
 import time
 import uuid
 from collections import deque
@@ -57,6 +58,7 @@ from server.protocol.client_messages import (
 from server.protocol.codecs.registry import Encoding
 from server.protocol.codes import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
 from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
+from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
@@ -68,7 +70,7 @@ from server.streaming.inbox import ChosenSteps
 from server.streaming.load_policy import Ladder
 from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import Offer, QualityStep
-from server.streaming.render_costs import kind_of
+from server.streaming.render_costs import kind_of, measure_rendering
 from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
@@ -121,7 +123,7 @@ class StreamHost:
 
     scenes: Mapping[str, FieldsByLevel]
     clips: Mapping[str, ClipLibrary]
-    """Clip libraries by scene; each has the scene's sample rate."""
+    """Clip libraries by scene; each has the scene's sample rate, and one for each other rate of streams."""
     hrtfs: HrtfLibrary
     audio: AudioEngine
     settings: Settings
@@ -130,14 +132,15 @@ class StreamHost:
     peers: ProcessPeers | None = None
     """The processes that serve at one port, if this is one of them."""
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
-    ambisonic_offers: dict[tuple[str, int], Offer] = dataclasses.field(default_factory=dict)
-    """The same for streams of ambisonics, by scene and order, once one was asked for."""
+    other_offers: dict[tuple[str, int, int | None], Offer] = dataclasses.field(default_factory=dict)
+    """The same for streams at another sample rate than the scene's, or of ambisonics: by scene, rate and order, once
+    one was asked for."""
     places: dict[str, SceneAcoustics] = dataclasses.field(default_factory=dict)
     """Acoustics of each scene, for the planner of effects."""
     effect_costs: dict[str, Mapping[int | None, Costs]] = dataclasses.field(default_factory=dict)
     """Costs of effects by scene, once they are measured, for each order of its levels' buses and without one (None)."""
-    render_costs: dict[str, Mapping[str, RenderCost]] = dataclasses.field(default_factory=dict)
-    """Costs of rendering by scene and quality level, once they are measured."""
+    render_costs: dict[tuple[str, int], Mapping[str, RenderCost]] = dataclasses.field(default_factory=dict)
+    """Costs of rendering by scene and sample rate, and quality level, once they are measured."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
     admission: Admission = dataclasses.field(init=False)
@@ -163,7 +166,7 @@ class StreamHost:
 
     def kind_of(self, hello: Hello, levels: FieldsByLevel) -> StreamKind | None:
         """The kind of stream that a hello asks for; None until it is measured what rendering costs."""
-        costs = self.render_costs.get(hello.scene)
+        costs = self.render_costs.get((hello.scene, levels.default.sample_rate))
         if costs is None:
             return None
         return kind_of(levels, costs, block_size=hello.block_size, order=hello.ambisonic_order)
@@ -178,16 +181,27 @@ class StreamHost:
         error = refusal.error
         return problem(503, error.code, str(error), retry_after_s=error.retry_after_s)
 
-    def measure_ambisonics(self, scene: str, levels: FieldsByLevel, order: int) -> Offer:
-        """Measure what ambisonic responses of a scene's levels cost on this host, and keep the result: work for another
-        thread."""
-        offer = self.ambisonic_offers.get((scene, order))
+    def measure(self, scene: str, levels: FieldsByLevel, order: int | None) -> Offer:
+        """Measure what responses of a scene's levels cost on this host at their sample rate, ambisonic ones with an
+        `order`; and what rendering at that rate costs. Keep the results. This is work for another thread."""
+        rate = levels.default.sample_rate
+        offer = self.other_offers.get((scene, rate, order))
         if offer is None:
-            filters = self.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
+            head = self.head(DEFAULT_HRTF, levels)
+            if (scene, rate) not in self.render_costs:
+                whole = self.scenes[scene].at_rate(rate)
+                self.render_costs[scene, rate] = measure_rendering(whole, *head)
             offered = tuple(levels[name].level for name in levels.names)
-            offer = Offer(offered, calibrate(levels, filters, order=order))
-            self.ambisonic_offers[scene, order] = offer
+            offer = Offer(offered, calibrate(levels, *head, order=order))
+            self.other_offers[scene, rate, order] = offer
         return offer
+
+    def head(self, name: str, levels: FieldsByLevel) -> tuple[HeadFilters, HeadFilters]:
+        """The filters of a head at the rate of some levels, and at their scene's own. Raises RequestError
+        unknown_hrtf."""
+        rates = levels.default.sample_rate, levels.own_rate
+        at_rate, at_own = (self.hrtfs.filters(name, rate) for rate in rates)
+        return at_rate, at_own
 
     def await_hello(self, patience: asyncio.Timeout) -> None:
         """Note a connection that has not sent its hello yet. If there are too many, end the oldest."""
@@ -302,6 +316,7 @@ class Connection:
         levels = self._host.scenes.get(hello.scene)
         if levels is None:
             raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
+        levels = levels.at_rate(hello.sample_rate)
         if hello.ambisonic_order is not None:
             levels = levels.with_directions(hello.level)
         return levels, await self._offer(hello, levels)
@@ -319,7 +334,7 @@ class Connection:
         settings = self._host.settings
         field = levels.default
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
-        window = settings.window_blocks + hello.buffer_blocks
+        window = math.ceil(settings.window_blocks * field.sample_rate / levels.own_rate) + hello.buffer_blocks
         self._capacity = window + MAX_WAITING_ANSWERS
         try:
             session = await self._host.openings.run(
@@ -357,15 +372,15 @@ class Connection:
         )
 
     async def _offer(self, hello: Hello, levels: FieldsByLevel) -> Offer | None:
-        """The levels for a hello, with their costs. Those of an ambisonic order are measured when a stream first asks
-        for it. Returns None if the client has gone meanwhile."""
-        host, order = self._host, hello.ambisonic_order
-        if order is None:
+        """The levels for a hello, with their costs. Those of an ambisonic order, or of another sample rate than the
+        scene's, are measured when a stream first asks for them. Returns None if the client has gone meanwhile."""
+        host, order, rate = self._host, hello.ambisonic_order, levels.default.sample_rate
+        if order is None and rate == levels.own_rate:
             return host.offers[hello.scene]
-        measured = host.ambisonic_offers.get((hello.scene, order))
+        measured = host.other_offers.get((hello.scene, rate, order))
         if measured is None:
             measured = await host.openings.run(
-                partial(host.measure_ambisonics, hello.scene, levels, order), is_wanted=self._is_there
+                partial(host.measure, hello.scene, levels, order), is_wanted=self._is_there
             )
         return measured
 
@@ -375,18 +390,26 @@ class Connection:
     def _open_session(
         self, hello: Hello, levels: FieldsByLevel, hrtf: str, quality: QualityStep, window: int
     ) -> Session:
-        host, field = self._host, levels.default
+        host, rate = self._host, levels.default.sample_rate
+        filters, field_filters = host.head(hrtf, levels)
+        clips = host.clips[hello.scene].at_rate(rate)
         return Session(
             hello,
             levels,
-            host.hrtfs.filters(hrtf, field.sample_rate),
-            lambda name: load_clip(host.clips[hello.scene], name),
+            filters,
+            lambda name: load_clip(clips, name),
             quality=quality,
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
             window=window,
-            place=place_of(levels.bundle, host.places[hello.scene].reverberations, block_size=hello.block_size),
+            place=place_of(
+                levels.bundle,
+                host.places[hello.scene].reverberations,
+                block_size=hello.block_size,
+                sample_rate=rate,
+            ),
             costs=lambda bus: host.effect_costs.get(hello.scene, {}).get(bus, {}),
+            field_filters=field_filters,
         )
 
     async def _pump(self, stream: Stream, hello: Hello, place: Place) -> Goodbye | None:
@@ -414,8 +437,8 @@ class Connection:
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
         """Handle incoming messages until the client has gone."""
         if self._fast_path is not None:
-            emitters, rate = self._host.settings.max_emitters, self._host.scenes[hello.scene].default.sample_rate
-            self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=rate))
+            emitters = self._host.settings.max_emitters
+            self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=stream.sample_rate))
             self._fast_path.listen(self._handle_at_once)
         with contextlib.suppress(WebSocketDisconnect):
             while True:
@@ -445,7 +468,8 @@ class Connection:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
                 # Decoded here, off the event loop, so that the audio thread need not wait.
-                await asyncio.to_thread(load_clip, self._host.clips[hello.scene], message.clip)
+                clips = self._host.clips[hello.scene].at_rate(stream.sample_rate)
+                await asyncio.to_thread(load_clip, clips, message.clip)
             self._pass_on(message, stream)
         except RequestError as refusal:
             self._refuse(refusal, message)

@@ -48,7 +48,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "unknown_parameter": "422: the route has no parameter of this name; the message suggests the nearest",
     "unknown_scene": "404: there is no scene of this id",
     "unsupported_media_type": "415: the body is of another type than the route reads",
-    "unsupported_sample_rate": "404: no scene has this sample rate; the message lists those there are",
+    "unsupported_sample_rate": "404: no stream has this sample rate; the message lists those there are",
     "upgrade_required": "426: the address is a WebSocket; connect with ws:// or wss://",
 }
 """Meanings by code. Each begins with the HTTP status."""

@@ -365,7 +365,7 @@ async def hrtfs(request: Request) -> dict[str, Any]:
 async def decoder(
     request: Request,
     hrtf: str,
-    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that a scene has", examples=[24_000])],
+    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that streams have", examples=[48_000])],
     order: Annotated[
         WholeNumber, Query(**_between(ORDERS[0], ORDERS[-1]), description="of the ambisonic channels")
     ] = ORDERS[0],
@@ -378,9 +378,9 @@ async def decoder(
     heads.require(hrtf)
     if sample_rate not in heads.sample_rates:
         known = ", ".join(map(str, heads.sample_rates))
-        problem = f"no scene is rendered at {sample_rate} Hz, only at {known}"
+        problem = f"nothing is rendered at {sample_rate} Hz, only at {known}"
         raise RequestError("unsupported_sample_rate", problem, field="sample_rate", status=404)
-    filters = heads.filters(hrtf, sample_rate)
+    filters = await anyio.to_thread.run_sync(heads.filters, hrtf, sample_rate)
     return await _cached(
         request,
         computed_tag("decoder", hrtf, filters.digest, order, name),

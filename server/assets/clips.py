@@ -1,9 +1,10 @@
 """Clips: dry recordings that emitters play, bundled or from the user's files.
 
-A clip is decoded once, to mono at the rate of the scene. A file without samples, or with samples that are not audio, is
-refused as a whole.
+A clip is decoded once for each sample rate that streams ask for, to mono. A file without samples, or with samples that
+are not audio, is refused as a whole.
 """
 
+import copy
 import logging
 import tomllib
 from collections.abc import Mapping
@@ -92,6 +93,8 @@ class ClipLibrary:
 
     def __init__(self, sample_rate: int, files: Mapping[str, Path] | None = None) -> None:
         self.sample_rate = sample_rate
+        self._at_rates = {sample_rate: self}
+        self._rates_lock = Lock()  # of its own, since decoding holds the other for long
         with (_BUNDLED / "clips.toml").open("rb") as stream:
             self._labels: dict[str, dict[str, str]] = tomllib.load(stream)
         self._paths = {name: _BUNDLED / f"{name}.ogg" for name in self._labels}
@@ -102,6 +105,16 @@ class ClipLibrary:
             self._labels[name] = {"title": name, "credit": ""}
         self._decoded: dict[str, DryAudio] = {}
         self._lock = Lock()
+
+    def at_rate(self, sample_rate: int) -> "ClipLibrary":
+        """The library of the same clips at another sample rate. There is one for each rate, and it decodes clips
+        anew, from their files."""
+        with self._rates_lock:
+            if sample_rate not in self._at_rates:
+                other = copy.copy(self)
+                other.sample_rate, other._decoded, other._lock = sample_rate, {}, Lock()
+                self._at_rates[sample_rate] = other
+            return self._at_rates[sample_rate]
 
     @property
     def names(self) -> tuple[str, ...]:

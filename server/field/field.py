@@ -20,6 +20,7 @@ from server.acoustics.fast_length import next_fast_length
 from server.acoustics.geometry import Vector3, orientations_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
+from server.acoustics.resampling import resampled_length
 from server.acoustics.sound_path import DescribedPaths, SoundPathFinder
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.core.bounded_cache import BoundedCache
@@ -245,6 +246,11 @@ class AcousticField:
     @property
     def ir_samples(self) -> int:
         return self.bundle.manifest.codec.samples
+
+    @property
+    def paths(self) -> SoundPathFinder:
+        """Finds the way of the first sound through the scene."""
+        return self._paths
 
     def impulse_responses(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, *, remember: bool = False
@@ -486,13 +492,24 @@ def frozen_noise(bundle: Bundle, graph: FieldGraph) -> FrozenNoise:
 
 
 class Silence(AcousticField):
-    """The field of a scene without a network: silence after the direct sound and the first reflections."""
+    """The field of a scene without a network: silence after the direct sound and the first reflections, at any
+    `sample_rate`, by default the scene's."""
 
-    def __init__(self, bundle: Bundle, level: QualityLevel) -> None:
+    def __init__(self, bundle: Bundle, level: QualityLevel, sample_rate: int | None = None) -> None:
         self.bundle = bundle
         self.level = level
+        self._sample_rate = bundle.manifest.codec.sample_rate if sample_rate is None else sample_rate
         self.source = ComputedResponses(self.impulse_responses)
         self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+
+    @property
+    def sample_rate(self) -> int:
+        return self._sample_rate
+
+    @property
+    def ir_samples(self) -> int:
+        codec = self.bundle.manifest.codec
+        return resampled_length(codec.samples, codec.sample_rate, self._sample_rate)
 
     def through(self, filters: HeadFilters) -> "Silence":  # noqa: ARG002  all heads hear the same
         return self

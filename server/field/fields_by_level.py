@@ -9,8 +9,10 @@ from server.field.field import AcousticField, Silence, frozen_noise
 from server.field.graph import FieldGraph, open_graph
 from server.field.graphs import graph_of
 from server.field.node_responses import NODE_CACHE_BYTES, NodeCache
+from server.field.resampled_field import at_rate
 from server.field.runtime import InferenceSession
 from server.scene.bundle import Bundle
+from server.scene.limits import STREAM_RATES_HZ
 from server.scene.manifest import CodecParameters
 
 
@@ -80,6 +82,28 @@ class FieldsByLevel(Mapping[str, AcousticField]):
     def buses(self) -> list[int]:
         """The orders of the levels whose reflected sound is heard by a bus."""
         return sorted(order for order in self.by_bus if order is not None)
+
+    @property
+    def own_rate(self) -> int:
+        """The scene's sample rate, which is that of its networks."""
+        return self.bundle.manifest.codec.sample_rate
+
+    @property
+    def sample_rates(self) -> tuple[int, ...]:
+        """The sample rates at which streams of the scene can be rendered, in ascending order."""
+        return tuple(sorted({self.own_rate, *STREAM_RATES_HZ}))
+
+    def at_rate(self, sample_rate: int | None) -> "FieldsByLevel":
+        """The same levels with responses at one of `sample_rates`, by default the scene's own. Raises RequestError
+        unsupported_sample_rate for another."""
+        wanted = self.own_rate if sample_rate is None else sample_rate
+        if wanted == self.default.sample_rate:
+            return self
+        if wanted not in self.sample_rates:
+            offered = ", ".join(map(str, self.sample_rates))
+            problem = f"scene {self.bundle.id!r} is rendered at {offered} Hz: ask for one of these, or leave it out"
+            raise RequestError("unsupported_sample_rate", f"sample_rate: {problem}", field="sample_rate")
+        return FieldsByLevel([at_rate(field, wanted) for field in self._fields.values()], self.node_cache)
 
     @property
     def knows_directions(self) -> bool:

@@ -39,8 +39,8 @@ class Node(NamedTuple):
 
 
 class Snapped(NamedTuple):
-    """The response that stands for a pair of poses: that of `node`, shifted by `later_samples` (earlier if negative) so
-    that reflected sound keeps its delay after the direct sound."""
+    """The response that stands for a pair of poses: that of `node`, shifted by `later_samples` of the scene's own rate
+    (earlier if negative) so that reflected sound keeps its delay after the direct sound."""
 
     node: Node
     later_samples: int

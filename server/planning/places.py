@@ -14,6 +14,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.fast_length import next_fast_length
 from server.acoustics.geometry import Pose, Vector3
+from server.acoustics.resampling import resampled_length
 from server.acoustics.room_parameters import UnmeasurableError, interaural_cross_correlation
 from server.field.field import AcousticField
 from server.planning.scene_acoustics import Reverberation, SceneAcoustics
@@ -38,11 +39,16 @@ def place_of_field(field: AcousticField, block_size: int = 256) -> SceneAcoustic
     return place_of(field.bundle, known, block_size=block_size)
 
 
-def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: int = 256) -> SceneAcoustics:
+def place_of(
+    bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: int = 256, sample_rate: int | None = None
+) -> SceneAcoustics:
     """Return the acoustics of a bundle's scene. `known` are reverberations all over the place; empty if it has no
-    field."""
+    field. Blocks are at a stream's `sample_rate`, by default the scene's. Energies are always in the scene's band,
+    since that is all that a field knows."""
     manifest = bundle.manifest
-    stages = Partitioning(block_size, manifest.codec.samples).stages
+    codec = manifest.codec
+    rate = codec.sample_rate if sample_rate is None else sample_rate
+    stages = Partitioning(block_size, resampled_length(codec.samples, codec.sample_rate, rate)).stages
     return SceneAcoustics(
         minimum=manifest.bounds.minimum,
         maximum=manifest.bounds.maximum,
@@ -56,7 +62,7 @@ def place_of(bundle: Bundle, known: tuple[Reverberation, ...], *, block_size: in
         reverberations=known,
         transmits=manifest.transmission,
         holds_direct_sound=manifest.direct_sound == "field",
-        tail_start_s=stages[-1].start / manifest.codec.sample_rate if len(stages) > 1 else None,
+        tail_start_s=stages[-1].start / rate if len(stages) > 1 else None,
     )
 
 

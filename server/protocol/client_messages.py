@@ -2,7 +2,7 @@
 
 Control messages are JSON text, one object with a `type` each. Listener poses may also be 36-byte binary messages, and
 audio is always binary blocks (`server.protocol.blocks`). Binary is little endian. Units are metres, radians, decibels
-and samples at the scene's rate.
+and samples at the stream's rate.
 
 Every type here parses and serialises itself, so that the tests, the documentation and both ends of the stream share one
 definition. Client messages are validated here and nowhere else. A `RequestError` carries the code for the client.
@@ -90,16 +90,16 @@ class ListenerStart(_Directed):
 
 
 class Hello(Message):
-    """The first message asks for a scene and says how it is to be rendered. `sample_rate` may be left out; if given, it
-    has to be the scene's. `buffer_blocks` is how many blocks ahead of real time the server sends: a higher number copes
-    with a worse network, a lower one has less latency. `hrtf` names a head, one of GET /v1/hrtfs. `level` names a
-    quality level of the scene; with `auto` the server takes the best one that its host computes in time, and a cheaper
-    one under load. `output` says what plays the sound: for a mono loudspeaker, blocks have one channel. With
-    `ambisonics` blocks have the channels of `order` 1 (the default), 2 or 3 in the axes of the scene: ACN order, SN3D
-    norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn then changes nothing in
-    the blocks. `effects` switches effects on or off, whatever the plan would decide. `emitters` is how many emitters
-    the client is about to add: the server lets the stream in only if they fit, and keeps room for them for some
-    seconds. Without it the server expects as many as other streams have."""
+    """The first message asks for a scene and says how it is to be rendered. `sample_rate` is one of the scene's
+    `sample_rates`; without it the stream has the scene's own. `buffer_blocks` is how many blocks ahead of real time the
+    server sends: a higher number copes with a worse network, a lower one has less latency. `hrtf` names a head, one of
+    GET /v1/hrtfs. `level` names a quality level of the scene; with `auto` the server takes the best one that its host
+    computes in time, and a cheaper one under load. `output` says what plays the sound: for a mono loudspeaker, blocks
+    have one channel. With `ambisonics` blocks have the channels of `order` 1 (the default), 2 or 3 in the axes of the
+    scene: ACN order, SN3D norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn
+    then changes nothing in the blocks. `effects` switches effects on or off, whatever the plan would decide. `emitters`
+    is how many emitters the client is about to add: the server lets the stream in only if they fit, and keeps room for
+    them for some seconds. Without it the server expects as many as other streams have."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer

@@ -13,7 +13,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "hello_expected": "the first message was not a hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
     "unsupported_protocol": "the server speaks another version of the protocol",
-    "unsupported_sample_rate": "the scene has another sample rate",
+    "unsupported_sample_rate": "the scene is not rendered at this sample rate; the message lists those it is",
     "unknown_scene": "there is no such scene; GET /v1/scenes lists them",
     "unknown_hrtf": "there is no such head; GET /v1/hrtfs lists them",
     "unknown_level": "the scene has no quality level of this name",

@@ -74,8 +74,9 @@ _STUDIO: Final = SceneDescription(
     id="studio",
     name="Studio",
     description="A live room with a booth.",
-    sample_rate=48_000,
-    ir_samples=24_000,
+    sample_rate=24_000,
+    sample_rates=(24_000, 44_100, 48_000, 96_000),
+    ir_samples=12_000,
     channels=("left", "right"),
     speed_of_sound=343.0,
     bounds=Bounds(minimum=(0.3, 0.3, 0.5), maximum=(6.7, 3.7, 2.3)),
@@ -96,7 +97,11 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     Step(
         "asks for a scene, and says where the listener stands",
         Hello(
-            protocol=PROTOCOL, scene="studio", block_size=256, listener=ListenerStart(position=(1.5, 2.0, 1.6), yaw=0.0)
+            protocol=PROTOCOL,
+            scene="studio",
+            sample_rate=48_000,
+            block_size=256,
+            listener=ListenerStart(position=(1.5, 2.0, 1.6), yaw=0.0),
         ),
     ),
     Step(

@@ -24,8 +24,9 @@ class Place(Message):
 
 class SceneDescription(Message):
     """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
-    are unknown. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are the
-    quality levels that know from where sound arrives, so that a stream of them may be ambisonic.
+    are unknown. `sample_rate` is that of the scene's fields and of single responses, and a stream may have any of
+    `sample_rates`. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are
+    the quality levels that know from where sound arrives, so that a stream of them may be ambisonic.
 
     `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
     scene's fields break, each with the reason why the scene is offered all the same.
@@ -35,6 +36,7 @@ class SceneDescription(Message):
     name: str
     description: str
     sample_rate: int
+    sample_rates: tuple[int, ...]
     ir_samples: int
     channels: tuple[str, ...]
     speed_of_sound: float
@@ -53,7 +55,8 @@ class SceneDescription(Message):
 
 class Welcome(Message):
     """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
-    `level` is the first quality level. `max_emitters` is how many emitters the stream may have at once. `order` is that
+    `sample_rate` is that of the stream, `ir_samples` the length of its longest response. `level` is the first quality
+    level. `max_emitters` is how many emitters the stream may have at once. `order` is that
     of ambisonic channels; streams of other outputs do not have it."""
 
     type: Literal["welcome"] = "welcome"

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 _Floats = npt.NDArray[np.float64]
 
 KEMAR = Path(__file__).parent / "hrtf_data" / "mit_kemar_normal_pinna.sofa"
-PREPARED_KEMAR = {rate: KEMAR.with_name(f"{KEMAR.stem}_{rate}_hz.npz") for rate in (24_000, 48_000)}
-"""KEMAR's filters as `HeadFilters.save` writes them, at each sample rate of the bundled scenes, in Hz. Reading the
-measurements and computing the filters would add two seconds to every start."""
+PREPARED_KEMAR = {rate: KEMAR.with_name(f"{KEMAR.stem}_{rate}_hz.npz") for rate in (24_000, 44_100, 48_000, 96_000)}
+"""KEMAR's filters as `HeadFilters.save` writes them, at the sample rates of the bundled scenes and of streams, in Hz.
+Reading the measurements and computing the filters would add two seconds to every start."""
 
 _ROWS_AT_ONCE = 32
 """How many responses are resampled together. soxr needs 120 kB for each, and is slower with more at once."""
@@ -34,7 +34,13 @@ _LEAD_S = 0.001
 _LENGTH_S = 0.0045
 
 _LEVEL_RATE = 24_000
-"""The level is measured in the band of this sample rate (Hz), so that it is the same at every rate."""
+"""Level and time are measured in the band of this sample rate (Hz), so that they are the same at every rate."""
+_TIMED_HZ = (500.0, 4_000.0)
+"""The band in which filters of all rates are equally late."""
+_MEASURED_SHARE = 0.9
+"""Of the band of a file. Beyond, the anti-aliasing filter of the measurement is heard and not the head: its phase alone
+would make a filter at 96 kHz 40 us late."""
+_THIRD = 2 ** (1 / 3)
 
 _FILTER_S = 0.004
 """Seconds. KEMAR's responses keep their magnitude to 0.01 dB when cut to this length; at 2.7 ms one percent of the
@@ -47,12 +53,15 @@ _FLOOR = 1e-5  # relative to the loudest frequency of a response: no file is acc
 @dataclass(frozen=True)
 class Hrtf:
     """A head's impulse responses (direction, ear, sample). Sample `lead_samples` is the moment when the wave passes the
-    head's centre, which is when a source straight ahead begins to be heard."""
+    head's centre, which is when a source straight ahead begins to be heard. Up to `band_hz` the responses are those of
+    a head. `reference` are the same at the sample rate at which level and time are measured, if that is another."""
 
     directions: _Floats
     impulse_responses: _Floats
     sample_rate: int
     lead_samples: int
+    band_hz: float = np.inf
+    reference: "Hrtf | None" = None
 
     @classmethod
     def read(cls, path: Path, sample_rate: int) -> "Hrtf":
@@ -70,11 +79,18 @@ class Hrtf:
         if not at_left.max() > 2 * at_left.min():
             raise HrtfError(path, "the ears sound alike at azimuth 90 degrees; not a free-field HRIR")
         swapped = bool(at_left[1] > at_left[0])
-        reference = _cut(measured, _LEVEL_RATE, swapped)
-        energy = np.mean(np.sum(reference**2, axis=-1), axis=-1)
-        responses = reference if sample_rate == _LEVEL_RATE else _cut(measured, sample_rate, swapped)
-        gain = _LEVEL_RATE / sample_rate / np.sqrt(np.sum(solid_angles(measured.directions) * energy))
-        return cls(measured.directions, responses * gain, sample_rate, round(_LEAD_S * sample_rate))
+        responses = _cut(measured, _LEVEL_RATE, swapped)
+        energy = np.mean(np.sum(responses**2, axis=-1), axis=-1)
+        gain = 1 / np.sqrt(np.sum(solid_angles(measured.directions) * energy))
+        band_hz = _MEASURED_SHARE * measured.sample_rate / 2
+        lead = round(_LEAD_S * _LEVEL_RATE)
+        reference = cls(measured.directions, responses * gain, _LEVEL_RATE, lead, band_hz)
+        if sample_rate == _LEVEL_RATE:
+            return reference
+        gain *= _LEVEL_RATE / sample_rate
+        responses = _cut(measured, sample_rate, swapped) * gain
+        lead = round(_LEAD_S * sample_rate)
+        return cls(measured.directions, responses, sample_rate, lead, band_hz, reference)
 
     @cached_property
     def _tree(self) -> "cKDTree":
@@ -135,7 +151,8 @@ class HeadFilters:
 
     `directions` (d, 3); `cepstra` (d, ear, tap), folded; `delays_s` (d, ear), counted from the moment when the wave
     passes the head's centre, which is when a source straight ahead begins to be heard. Between directions, log
-    magnitudes and delays are interpolated over spherical triangles.
+    magnitudes and delays are interpolated over spherical triangles. Filters of one head at several rates have the same
+    delays, those of their minimum phase included.
     """
 
     sample_rate: int
@@ -156,13 +173,20 @@ class HeadFilters:
         for part in portions(len(responses)):
             magnitude = np.abs(np.fft.rfft(responses[part], n_fft))
             magnitude = np.maximum(magnitude, _FLOOR * magnitude.max(axis=-1, keepdims=True))
-            cepstra[part] = folded_cepstrum(np.log(magnitude))[..., :taps]
-            delays_s[part] = excess_delays_samples(responses[part], hrtf.sample_rate) / hrtf.sample_rate
+            logarithm = _held(np.log(magnitude), hrtf.sample_rate, hrtf.band_hz)
+            cepstra[part] = folded_cepstrum(logarithm)[..., :taps]
+            if hrtf.reference is None:
+                delays_s[part] = excess_delays_samples(responses[part], hrtf.sample_rate) / hrtf.sample_rate
+        directions, shares = fill_gaps(hrtf.directions)
+        cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])
+        if hrtf.reference is not None:
+            reference = cls.from_hrtf(hrtf.reference)
+            earlier_s = _phase_delays_s(reference.cepstra, reference.sample_rate)
+            delays_s = reference.delays_s + earlier_s - _phase_delays_s(cepstra, hrtf.sample_rate)
+            return cls(hrtf.sample_rate, directions, cepstra.astype(np.float32), delays_s, reference.triangulation)
         common_s = delays_s.mean(axis=-1)
         # guard: rings of a measured head are smoothed
         delays_s += (_smooth(hrtf.directions, common_s) - common_s)[:, None]
-        directions, shares = fill_gaps(hrtf.directions)
-        cepstra = np.concatenate([cepstra, np.einsum("gd,det->get", shares, cepstra)])
         delays_s = np.concatenate([delays_s, shares @ delays_s])
         return cls(hrtf.sample_rate, directions, cepstra.astype(np.float32), delays_s, triangulate(directions))
 
@@ -234,6 +258,27 @@ class NoHead:
         self.cepstra = np.zeros((1, 1, self.taps), np.float32)
         self.delays_s = np.zeros((1, 1))
         self.triangulation = Triangulation(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3)))
+
+
+def _held(log_magnitude: _Floats, sample_rate: int, band_hz: float) -> _Floats:
+    """Log magnitudes (..., bin) that beyond a head's measured band stay at the mean of its last third of an octave."""
+    frequency = np.linspace(0, sample_rate / 2, log_magnitude.shape[-1])
+    if band_hz >= sample_rate / 2:
+        return log_magnitude
+    last_third = (frequency > band_hz / _THIRD) & (frequency <= band_hz)
+    level = log_magnitude[..., last_third].mean(axis=-1, keepdims=True)
+    passed = np.clip((frequency * _THIRD - band_hz) / (band_hz * (_THIRD - 1)), 0, 1)
+    return np.asarray(log_magnitude + (0.5 - 0.5 * np.cos(np.pi * passed)) * (level - log_magnitude))
+
+
+def _phase_delays_s(cepstra: npt.NDArray[np.floating], sample_rate: int) -> _Floats:
+    """The delays (d, ear) of minimum-phase filters with these cepstra (d, ear, tap): those of their phase at best."""
+    taps = np.arange(cepstra.shape[-1])
+    frequency = np.linspace(*_TIMED_HZ, 64)
+    # The phase is -sum_n c[n] sin(2 pi f n / rate). Of all delays, the least-squares one fits it over the band.
+    sines = np.sin(2 * np.pi * np.outer(taps, frequency) / sample_rate)
+    turns = 2 * np.pi * frequency
+    return np.asarray(cepstra @ (sines @ turns / (turns @ turns)), dtype=np.float64)
 
 
 def _smooth(directions: _Floats, common_s: _Floats) -> _Floats:

@@ -82,10 +82,13 @@ class DirectSound:
     """The direct sound in one scene, through one head or, with an `order`, as ambisonic channels in world axes;
     `air_db_per_m` (7,) is per octave band.
 
+    Everything here is at the sample rate of `filters`, that of a stream. `field_filters` are the same head at the rate
+    of the scene's fields; by default they are `filters`.
+
     `early_reflections` are computed here if the responses of the scene's fields leave them out; otherwise None. If the
     fields include the direct sound, a renderer has none to add and there are no `filters`; if those fields are also
-    mono, `binauralization` renders them for the listener's ears. `field_gain` is the linear factor from the fields'
-    responses to unit pressure at one metre from an emitter.
+    mono, `binauralization` renders them for the listener's ears, at the fields' own rate. `field_gain` is the linear
+    factor from the fields' responses to unit pressure at one metre from an emitter.
     """
 
     def __init__(
@@ -100,6 +103,7 @@ class DirectSound:
         binauralization: Binauralization | None = None,
         field_gain: float = 1.0,
         order: int | None = None,
+        field_filters: HeadFilters | None = None,
     ) -> None:
         self.early_reflections = early_reflections
         self.early_without_head = early_without_head
@@ -111,9 +115,19 @@ class DirectSound:
         self._speed_of_sound = speed_of_sound
         self._air_db_per_m = air_db_per_m
         self._filters = filters
+        self._field_filters = filters if field_filters is None else field_filters
 
     @classmethod
-    def of(cls, bundle: Bundle, filters: HeadFilters, *, order: int | None = None) -> "DirectSound":
+    def of(
+        cls,
+        bundle: Bundle,
+        filters: HeadFilters,
+        *,
+        order: int | None = None,
+        field_filters: HeadFilters | None = None,
+    ) -> "DirectSound":
+        """The direct sound at the rate of `filters`. Where that is not the scene's, `field_filters` are those of the
+        same head at the scene's rate."""
         manifest = bundle.manifest
         return cls(
             bundle.floor_plan,
@@ -122,9 +136,10 @@ class DirectSound:
             filters=filters if manifest.direct_sound == "geometry" else None,
             early_reflections=EarlyReflections.of(bundle, filters),
             early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),
-            binauralization=Binauralization.of(bundle, filters),
+            binauralization=Binauralization.of(bundle, filters if field_filters is None else field_filters),
             field_gain=float(db_to_amplitude(-manifest.reference_level_db)),
             order=order,
+            field_filters=field_filters,
         )
 
     def renderer(
@@ -166,7 +181,7 @@ class DirectSound:
         """The field heard through the head of this direct sound or, for more channels than two, as ambisonic ones."""
         if channels > 2:
             return field.encoded(round(channels**0.5) - 1)
-        return field if self._filters is None else field.through(self._filters)
+        return field if self._filters is None or self._field_filters is None else field.through(self._field_filters)
 
     def early(self, channels: int) -> EarlyReflections | None:
         """The first reflections for two ears, for one channel without a head, or for ambisonic channels."""

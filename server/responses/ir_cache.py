@@ -79,7 +79,7 @@ def _whole(
 ) -> PartitionedIr:
     snapped = field.snap(listener.position, emitter.pose.position, listener.yaw)
     identity = _identity(field.level, early, snapped, emitter)
-    key = identity, None if early is None else early.filters, renderer.preparation
+    key = identity, field.sample_rate, None if early is None else early.filters, renderer.preparation
     ir = cache.get(key)
     if not isinstance(ir, PartitionedIr):
         samples = field.source.response(snapped)
@@ -99,7 +99,7 @@ def _with_first_reflections(
     emitter: EmitterState,
 ) -> PartitionedIr:
     snapped = field.snap(listener.position, emitter.pose.position, listener.yaw)
-    key = field.level.name, *snapped, renderer.preparation
+    key = field.level.name, *snapped, field.sample_rate, renderer.preparation
     late = cache.get(key)
     if not isinstance(late, _Late):
         samples = field.source.response(snapped)

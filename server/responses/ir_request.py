@@ -9,6 +9,7 @@ import numpy.typing as npt
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
+from server.field.resampled_field import ResampledField
 from server.rendering.convolver import PartitionedIr
 from server.rendering.renderer import Renderer
 from server.responses.direct_sound import DirectSound
@@ -97,11 +98,9 @@ def composed_irs(
     many of each response are computed."""
     count = len(emitters)
     field, listener = direct.heard(field, channels), direct.axes_for(listener, channels)
-    held = _held(field, direct, listener, emitters, remember=remember, samples=samples)
+    irs = _field_part(field, direct, listener, emitters, channels, remember=remember, samples=samples)
     if direct.binauralization is not None:
-        places = [emitter.pose.position for emitter in emitters]
-        return direct.binauralization.binauralize(held, listener, places) if channels == 2 else held
-    irs = binaural_to_mono(held, field.sample_rate) if channels == 1 else held
+        return irs
     early = direct.early(channels)
     mirrored = [row for row, emitter in enumerate(emitters) if emitter.effects.early]
     if early is not None and 0 < len(mirrored) == count:
@@ -116,6 +115,29 @@ def composed_irs(
         direct.add(whole, listener, [emitters[row] for row in standing])
         irs[standing] = whole
     return irs
+
+
+def _field_part(
+    field: AcousticField,
+    direct: DirectSound,
+    listener: Pose,
+    emitters: Sequence[EmitterState],
+    channels: int,
+    *,
+    remember: bool,
+    samples: int | None,
+) -> npt.NDArray[np.float32]:
+    """Return the part of the responses that the field knows. It is made at the rate of the scene, and then resampled
+    if a stream has another."""
+    if isinstance(field, ResampledField):
+        own = None if samples is None else field.own_samples(samples)
+        irs = _field_part(field.resampled, direct, listener, emitters, channels, remember=remember, samples=own)
+        return field.resample(irs, samples)
+    held = _held(field, direct, listener, emitters, remember=remember, samples=samples)
+    if direct.binauralization is not None:
+        places = [emitter.pose.position for emitter in emitters]
+        return direct.binauralization.binauralize(held, listener, places) if channels == 2 else held
+    return binaural_to_mono(held, field.sample_rate) if channels == 1 else held
 
 
 def _held(

@@ -33,4 +33,5 @@ def add_first_reflections(
         there = np.zeros_like(response)
         at_node = replace(emitter, pose=Pose(node.emitter, emitter.pose.orientation))
         early.add(there[np.newaxis], Pose.from_yaw(node.listener, node.yaw), [at_node])
-        response += delay_response(there, later)
+        own_rate = field.bundle.manifest.codec.sample_rate
+        response += delay_response(there, round(later * field.sample_rate / own_rate))

@@ -141,9 +141,9 @@ class Admission:
         self._time_s, self._loop_cpu_s, self._luck = time_s, loop_cpu_s, luck
         self._places: dict[Place, None] = {}
         self._by_stream: dict[Stream, Place] = {}
-        self._corrections: dict[tuple[str, int, int | None, str], Correction] = {}
+        self._corrections: dict[tuple[str, int, int, int | None, str], Correction] = {}
         """By kind and quality level."""
-        self._cheapest: dict[tuple[str, int, int | None], tuple[StreamKind, QualityStep]] = {}
+        self._cheapest: dict[tuple[str, int, int, int | None], tuple[StreamKind, QualityStep]] = {}
         self._endings_s: deque[float] = deque(maxlen=limits.endings)
         self._refused_until_s: deque[float] = deque(maxlen=4 * most_streams)
         self._emitters: deque[int] = deque(maxlen=_SHOWN_EMITTERS)

@@ -29,7 +29,8 @@ class Listener:
     """A listener to one emitter with all effects on, at the level of `field`, served as a stream is; with an `order`,
     as a stream of ambisonics.
 
-    `node_cache` has the responses kept from before; `time_s` is the clock.
+    `filters` are at the field's sample rate and `field_filters` at that of its scene, if it is another. `node_cache`
+    has the responses kept from before; `time_s` is the clock.
     """
 
     def __init__(
@@ -40,12 +41,13 @@ class Listener:
         node_cache: NodeCache | None = None,
         time_s: Callable[[], float] = time.perf_counter,
         order: int | None = None,
+        field_filters: HeadFilters | None = None,
     ) -> None:
         self._field = field
         self._node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self._levels = FieldsByLevel([field], self._node_cache)
         self._time_s = time_s
-        self._direct_sound = DirectSound.of(field.bundle, filters, order=order)
+        self._direct_sound = DirectSound.of(field.bundle, filters, order=order, field_filters=field_filters)
         self._renderer = self._direct_sound.renderer(
             block_size=_BLOCK_SIZE,
             ir_samples=field.ir_samples,
@@ -87,10 +89,16 @@ class Listener:
 
 
 def calibrate(
-    levels: FieldsByLevel, filters: HeadFilters, poses: int = POSES, order: int | None = None
+    levels: FieldsByLevel,
+    filters: HeadFilters,
+    field_filters: HeadFilters | None = None,
+    *,
+    poses: int = POSES,
+    order: int | None = None,
 ) -> dict[str, float]:
     """Return the milliseconds that a new response takes on this host now, by level: the median of `poses`, or of fewer
-    for a slow level. With an `order`, responses are ambisonic.
+    for a slow level. `filters` are at the sample rate of the levels, and `field_filters` at that of their scene, if it
+    is another. With an `order`, responses are ambisonic.
 
     Times are CPU time of this thread, so that other load has little influence; levels take turns, so that it affects
     all of them alike. The caches of `levels` are cleared.
@@ -98,7 +106,14 @@ def calibrate(
     start = levels.bundle.manifest.start
     places = [(float(x), float(y), float(z)) for x, y, z in np.linspace(start.listener, start.emitter, poses)]
     listeners = {
-        name: Listener(field, filters, node_cache=levels.node_cache, time_s=time.thread_time, order=order)
+        name: Listener(
+            field,
+            filters,
+            node_cache=levels.node_cache,
+            time_s=time.thread_time,
+            order=order,
+            field_filters=field_filters,
+        )
         for name, field in levels.items()
     }
     times_ms: dict[str, list[float]] = {name: [] for name in levels}

@@ -104,11 +104,11 @@ class RenderCost:
 
 @dataclass(frozen=True)
 class StreamKind:
-    """What streams of one scene, block length and output cost on this host. `render` has the costs of each quality
-    level, and `walk` the mean cost of an IR on a walk as a share of that of one for which no other can be reused; `key`
-    identifies the kind."""
+    """What streams of one scene, sample rate, block length and output cost on this host. `render` has the costs of each
+    quality level, and `walk` the mean cost of an IR on a walk as a share of that of one for which no other can be
+    reused; `key` identifies the kind."""
 
-    key: tuple[str, int, int | None]
+    key: tuple[str, int, int, int | None]
     block_s: float
     render: Mapping[str, RenderCost]
     walk: Mapping[str, float] = field(default_factory=dict)

@@ -29,16 +29,23 @@ _CLIP_SAMPLES = 8_192
 
 
 def measure_rendering(
-    levels: FieldsByLevel, filters: HeadFilters, *, time_s: Callable[[], float] = time.thread_time
+    levels: FieldsByLevel,
+    filters: HeadFilters,
+    field_filters: HeadFilters | None = None,
+    *,
+    time_s: Callable[[], float] = time.thread_time,
 ) -> dict[str, RenderCost]:
-    """Return the costs of streams for two ears in blocks of `BLOCK_SIZE`, by level. Levels that are rendered in the
-    same way are measured once. `time_s` is the CPU time of this thread, so that other load has little influence."""
+    """Return the costs of streams for two ears in blocks of `BLOCK_SIZE`, by level, at the sample rate of the levels
+    and `filters`; `field_filters` are at that of their scene, if it is another. Levels that are rendered in the same
+    way are measured once. `time_s` is the CPU time of this thread, so that other load has little influence."""
     ways: dict[Hashable, list[str]] = {}
     for name, field in levels.items():
         ways.setdefault((field.level.shared_tail, field.level.bus), []).append(name)
     costs: dict[str, RenderCost] = {}
     for names in ways.values():
-        few, many = (_time_blocks(levels, filters, names[0], count, time_s) for count in (1, _EMITTERS))
+        few, many = (
+            _time_blocks(_Walk(levels, filters, field_filters, names[0], count), time_s) for count in (1, _EMITTERS)
+        )
         emitter_s = max(0.0, (many[0] - few[0]) / (_EMITTERS - 1))
         cost = RenderCost(max(0.0, few[0] - emitter_s), emitter_s, max(0.0, many[1] / _EMITTERS))
         costs |= dict.fromkeys(names, cost)
@@ -57,7 +64,8 @@ def kind_of(
         for name, cost in costs.items()
     }
     walk = {name: _walk_share(field.level) for name, field in levels.items()}
-    return StreamKind((levels.bundle.id, block_size, order), block_size / levels.default.sample_rate, scaled, walk)
+    rate = levels.default.sample_rate
+    return StreamKind((levels.bundle.id, rate, block_size, order), block_size / rate, scaled, walk)
 
 
 def _walk_share(level: QualityLevel) -> float:
@@ -67,12 +75,9 @@ def _walk_share(level: QualityLevel) -> float:
     return min(1.0, level.cost.ms_mean / level.cost.ms_miss)
 
 
-def _time_blocks(
-    levels: FieldsByLevel, filters: HeadFilters, level: str, emitters: int, time_s: Callable[[], float]
-) -> tuple[float, float]:
+def _time_blocks(walk: "_Walk", time_s: Callable[[], float]) -> tuple[float, float]:
     """Return the CPU seconds of a block while the listener moves, and what an exchange of the IRs of all emitters
     adds."""
-    walk = _Walk(levels, filters, level, emitters)
     plain, exchanging = [], []
     for turn in range(_ROUNDS + 1):
         began_s = time_s()
@@ -94,19 +99,32 @@ def _time_blocks(
 class _Walk:
     """A session whose listener takes a step with each block."""
 
-    def __init__(self, levels: FieldsByLevel, filters: HeadFilters, level: str, emitters: int) -> None:
+    def __init__(
+        self,
+        levels: FieldsByLevel,
+        filters: HeadFilters,
+        field_filters: HeadFilters | None,
+        level: str,
+        emitters: int,
+    ) -> None:
         field = levels[level]
         start = levels.bundle.manifest.start
         clip = DryAudio(0.1 * np.random.default_rng(0).standard_normal(_CLIP_SAMPLES))
         self._levels = levels
         self._session = Session(
-            Hello(protocol=PROTOCOL, scene=levels.bundle.id, block_size=BLOCK_SIZE),
+            Hello(
+                protocol=PROTOCOL,
+                scene=levels.bundle.id,
+                sample_rate=levels.default.sample_rate,
+                block_size=BLOCK_SIZE,
+            ),
             levels,
             filters,
             lambda _: clip,
             quality=QualityStep.full(field.level, 1.0),
             max_emitters=emitters,
             window=2 * (_ROUNDS + 2) * _BLOCKS,
+            field_filters=field_filters,
         )
         for number in range(emitters):
             self._session.receive(AddEmitter(id=str(number), clip="noise", position=start.emitter))

@@ -61,22 +61,21 @@ def _start_pose(bundle: Bundle) -> Pose:
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
 
 
-def _require_served(hello: Hello, sample_rate: int) -> None:
-    """Check the hello. Raises RequestError for an unknown protocol or another sample rate than the scene's."""
+def _require_served(hello: Hello) -> None:
+    """Raises RequestError for an unknown protocol."""
     if hello.protocol != PROTOCOL:
         problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
         raise RequestError("unsupported_protocol", problem, field="protocol")
-    if hello.sample_rate not in {None, sample_rate}:
-        problem = f"scene {hello.scene!r} is rendered at {sample_rate} Hz: ask for that, or leave sample_rate out"
-        raise RequestError("unsupported_sample_rate", problem, field="sample_rate")
 
 
 class Session:
     """The state of one client's stream: poses, emitters, a renderer and the window of unacknowledged blocks.
 
-    `levels` are the scene's, and `quality` is the first one to render. `filters` are those of the listener's head.
-    `load_clip` returns audio at the scene's rate; it has to be fast, since it is called on the rendering thread. Raises
-    RequestError for a hello that cannot be served, such as no_directions.
+    `levels` are the scene's, at any rate, and `quality` is the first one to render. The stream has the sample rate that
+    the hello asks for, or the scene's own. `filters` are those of the listener's head at the stream's rate, and
+    `field_filters` at the scene's, if that is another. `load_clip` returns audio at the stream's rate; it has to be
+    fast, since it is called on the rendering thread. Raises RequestError for a hello that cannot be served, such as
+    unsupported_sample_rate or no_directions, and ValueError for filters of another rate.
     """
 
     def __init__(
@@ -92,9 +91,15 @@ class Session:
         window: int = 40,
         place: SceneAcoustics | None = None,
         costs: Callable[[int | None], Costs] = lambda _: {},
+        field_filters: HeadFilters | None = None,
     ) -> None:
+        _require_served(hello)
+        levels = levels.at_rate(hello.sample_rate)
         field = levels.default
-        _require_served(hello, field.sample_rate)
+        if filters.sample_rate != field.sample_rate:
+            raise ValueError(
+                f"the head is filtered for {filters.sample_rate} Hz, the stream for {field.sample_rate} Hz"
+            )
         self.window = SendWindow(window)
         self.ir_exchanges = 0
         self.blocks_dropped = 0
@@ -106,7 +111,7 @@ class Session:
         if order is not None:
             levels = levels.with_directions()
         self._output = hello.output
-        self._direct_sound = DirectSound.of(self._bundle, filters, order=order)
+        self._direct_sound = DirectSound.of(self._bundle, filters, order=order, field_filters=field_filters)
         self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
         self._bundle.require_inside(self._listener.position, "listener.position")
         planned = None

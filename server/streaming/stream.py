@@ -162,6 +162,11 @@ class Stream:
         return self._levels.bundle.id
 
     @property
+    def sample_rate(self) -> int:
+        """The sample rate of its blocks and of live samples, in Hz."""
+        return self._levels.default.sample_rate
+
+    @property
     def awaits_irs_since_s(self) -> float | None:
         """Since when the stream waits for impulse responses; None if it does not."""
         return self._wait.since_s

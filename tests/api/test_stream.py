@@ -1,3 +1,4 @@
+import itertools
 import json
 import math
 import struct
@@ -175,6 +176,26 @@ def test_a_stream_of_ambisonics_from_hello_to_sound(client_of_directions):
         assert turned.samples.any()
 
 
+@pytest.mark.parametrize(("rate", "output"), [(48_000, "headphones"), (44_100, "ambisonics"), (96_000, "mono")])
+def test_a_stream_at_another_rate_than_the_scenes_plays_clips_at_their_pitch(client_of_directions, rate, output):
+    hello = HELLO.model_copy(update={"sample_rate": rate, "output": output, "block_size": 1024})
+    with client_of_directions.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, hello)
+        welcome = ears.welcome
+        assert (welcome.sample_rate, welcome.scene.sample_rate) == (rate, 24_000)
+        assert rate in welcome.scene.sample_rates
+        assert welcome.ir_samples == math.ceil(welcome.scene.ir_samples * rate / 24_000)
+        # The window lasts as long as at the scene's rate.
+        assert welcome.window - welcome.buffer_blocks == math.ceil(Settings().window_blocks * rate / 24_000)
+        ears.send(TALKER)
+        ears.until_sound()
+        blocks = [ears.until(AudioBlock) for _ in range(rate // 2 // 1024)]
+        assert {b.sample_clock - a.sample_clock for a, b in itertools.pairwise(blocks)} == {1024}
+        samples = np.concatenate([block.samples[0] for block in blocks])
+        spectrum = np.abs(np.fft.rfft(samples * np.hanning(samples.size), 8 * rate))
+        assert np.argmax(spectrum) / 8 == pytest.approx(0.1 * 24_000 / (2 * np.pi), abs=0.3)
+
+
 def test_a_stream_of_two_ears_has_no_order(client):
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_text(HELLO.serialize())
@@ -291,7 +312,7 @@ def test_a_clip_that_cannot_be_decoded_says_why(ears):
         (Hello(protocol=2, scene="flat").serialize(), "unsupported_protocol"),
         (Hello(protocol=PROTOCOL, scene="flat", hrtf="moomin").serialize(), "unknown_hrtf"),
         (Hello(protocol=PROTOCOL, scene="moon").serialize(), "unknown_scene"),
-        (Hello(protocol=PROTOCOL, scene="flat", sample_rate=48_000).serialize(), "unsupported_sample_rate"),
+        (Hello(protocol=PROTOCOL, scene="flat", sample_rate=32_000).serialize(), "unsupported_sample_rate"),
         (
             '{"type": "hello", "protocol": 3, "scene": "flat", "listener": {"position": [99, 1, 1]}}',
             "position_out_of_bounds",

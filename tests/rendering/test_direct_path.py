@@ -176,6 +176,11 @@ def test_output_is_the_delayed_signal_convolved_with_the_interpolated_response(m
     magnitude = np.abs(np.fft.rfft(hrtf.impulse_responses[corners], n_fft))
     audible = np.maximum(magnitude, 1e-5 * magnitude.max(axis=-1, keepdims=True))  # as the filters were made
     log_magnitude = np.einsum("k,kef->ef", shares, np.log(audible))
+    # Beyond what was measured of the head, the level of the last third of an octave.
+    octaves = np.log2(np.maximum(frequency * rate, 1) / hrtf.band_hz)
+    last = (octaves > -1 / 3) & (octaves <= 0) & (np.arange(len(octaves)) % 8 == 0)  # in the filters' own bins
+    held = (1 - np.cos(np.pi * np.clip((2 ** (octaves + 1 / 3) - 1) / (2 ** (1 / 3) - 1), 0, 1))) / 2
+    log_magnitude += held * (log_magnitude[:, last].mean(axis=-1, keepdims=True) - log_magnitude)
     cepstrum = np.fft.irfft(log_magnitude)
     cepstrum[:, 1 : n_fft // 2] *= 2
     cepstrum[:, n_fft // 2 + 1 :] = 0

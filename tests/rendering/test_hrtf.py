@@ -69,6 +69,35 @@ def test_level_is_the_same_at_every_rate(kemar, sample_rate):
         assert np.abs(difference).max() < 0.2
 
 
+@pytest.mark.parametrize("sample_rate", [44_100, 48_000, 96_000])
+def test_filters_of_one_head_are_equally_loud_and_late_at_every_rate(sample_rate):
+    frequency = np.linspace(600, 3_800, 9)
+
+    def responses(rate):
+        filters = HeadFilters.load(PREPARED_KEMAR[rate])
+        taps = np.arange(filters.taps)
+        logarithm = filters.cepstra @ np.exp(-2j * np.pi * np.outer(taps, frequency) / rate)
+        return np.exp(logarithm - 2j * np.pi * frequency * filters.delays_s[..., None])
+
+    ratio = responses(sample_rate) / responses(24_000)
+    assert np.abs(amplitude_to_db(np.abs(ratio))).max() < 1
+    assert np.abs(amplitude_to_db(np.abs(ratio))).mean() < 0.05
+    late_s = -np.angle(ratio) / (2 * np.pi * frequency)
+    assert np.abs(late_s.mean(axis=-1)).max() < 1e-6
+    assert np.sqrt(np.mean(late_s**2)) < 1e-6
+
+
+def test_a_head_does_not_hear_the_filter_of_its_measurement():
+    """The file has no sound from 22.05 kHz on, and a head has."""
+    filters = HeadFilters.load(PREPARED_KEMAR[96_000])
+    log_magnitude = np.fft.rfft(filters.cepstra.astype(float), 4_096).real
+    frequency = np.fft.rfftfreq(4_096, 1 / 96_000)
+    last_third = log_magnitude[..., (frequency > 15_800) & (frequency < 19_800)].mean(axis=-1)
+    beyond = log_magnitude[..., frequency > 24_000]
+    nepers = np.log(10) / 20
+    assert np.abs(beyond - last_third[..., None]).max() < 6 * nepers  # without its filter it would be 60 dB
+
+
 @pytest.mark.parametrize("sample_rate", [16_000, 24_000, 44_100, 48_000])
 def test_a_wave_from_ahead_reaches_both_ears_when_it_passes_the_centre(sample_rate):
     hrtf = Hrtf.read(KEMAR, sample_rate)

@@ -32,7 +32,7 @@ def test_its_only_level_is_silence(open_field):
     assert responses.shape == (3, 2, levels.default.ir_samples)
     assert not responses.any()
     assert not levels.default.energy([(0, 0, 1.5)], [(4, 0, 1.5)], [0]).any()
-    assert calibrate(levels, kemar(levels.default.sample_rate), 2)
+    assert calibrate(levels, kemar(levels.default.sample_rate), poses=2)
 
 
 def test_an_impulse_arrives_when_and_as_loud_as_distance_has_it(open_field):

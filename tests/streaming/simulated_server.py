@@ -497,7 +497,7 @@ class SimulatedServer:
             share = self._costs.shared[kind_of(level.level).sharing]
             render[name] = RenderCost(self._costs.tick_s / speed, share * each_s, exchange_s)
         walk = {name: level.walk_ms / level.miss_ms for name, level in self._levels.items()}
-        return StreamKind(("simulated", 1_024, None), BLOCK_S, render, walk)
+        return StreamKind(("simulated", 24_000, 1_024, None), BLOCK_S, render, walk)
 
     def _ask(self, client: Client, announces: bool) -> None:
         steps = self._offer.steps(AUTO, block_s=BLOCK_S)

@@ -1,0 +1,189 @@
+"""Streams at other sample rates than their scene's: they sound alike within its band, and only the direct sound and the
+first reflections go beyond it."""
+
+import numpy as np
+import pytest
+import soxr
+
+from server.acoustics.geometry import Pose
+from server.field.field import AcousticField
+from server.field.fields_by_level import FieldsByLevel
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.rendering.hrtf import kemar
+from server.responses.direct_sound import DirectSound
+from server.responses.ir_request import compute_irs
+from server.streaming.quality_steps import QualityStep
+from server.streaming.session import Session
+from tests.directional_flat import write_directional
+from tests.signals import error_db
+
+OWN = 24_000
+BLOCKS = {24_000: 256, 44_100: 512, 48_000: 512, 96_000: 1_024}
+RATES = pytest.mark.parametrize("rate", [44_100, 48_000, 96_000])
+SECONDS = 0.4
+
+
+def clip_at(rate, *, low_hz=200, high_hz=10_000):
+    """Noise of a band; the same at all rates, and quiet enough that no limiter acts."""
+    hz = 96_000
+    spectrum = np.fft.rfft(0.005 * np.random.default_rng(4).standard_normal(hz // 4))
+    frequency = np.fft.rfftfreq(hz // 4, 1 / hz)
+    noise = np.fft.irfft(spectrum * ((frequency > low_hz) & (frequency < high_hz))) * np.hanning(hz // 4)
+    return soxr.resample(noise, hz, rate, quality="VHQ").astype(np.float32)
+
+
+def places(field):
+    """Where the listener goes, and where the emitter is."""
+    start = field.bundle.manifest.start
+    x, y, z = start.listener
+    return (start.listener, (x, y + 0.5, z)), start.emitter
+
+
+def heard(field, rate, clip=None, **hello):
+    """(channel, n): at rest for half of the time, and in the other half half a metre away."""
+    levels = FieldsByLevel([field])
+    session = Session(
+        Hello(protocol=PROTOCOL, scene=field.bundle.id, sample_rate=rate, block_size=BLOCKS[rate], **hello),
+        levels,
+        kemar(rate),
+        lambda _: clip_at(rate) if clip is None else clip,
+        quality=QualityStep.full(field.level, 1.0),
+        window=10_000,
+        field_filters=kemar(OWN),
+    )
+    stops, emitter = places(field)
+    session.receive(AddEmitter(id="talker", clip="noise", position=emitter, loop=False))
+    blocks = []
+    for number, place in enumerate(stops, start=1):
+        session.receive(ListenerPose(pose_id=number, position=place, yaw=0.5 * number))
+        while (request := session.take_request()) is not None:
+            session.accept(compute_irs(levels.at_rate(rate), request, session.renderer))
+        blocks += [session.render_block().samples for _ in range(round(SECONDS / 2 * rate / BLOCKS[rate]))]
+    return np.concatenate(blocks, axis=1).astype(float)
+
+
+def dead(field):
+    """Nothing follows the direct sound any more."""
+    field.impulse_responses = lambda listeners, *_, **__: np.zeros((len(listeners), 2, field.ir_samples), np.float32)
+    return field
+
+
+def signal_to_noise_db(samples, rate, expected, *, seconds=SECONDS):
+    """Of samples at `rate`, resampled to the scene's."""
+    own = soxr.resample(samples.T, rate, OWN, quality="VHQ").T
+    length = round(seconds * OWN) - 300
+    error = own[:, :length] - expected[:, :length]
+    return 10 * np.log10(np.sum(expected[:, :length] ** 2) / np.sum(error**2))
+
+
+@RATES
+def test_reflected_sound_is_that_of_the_scenes_own_rate(bundle, rate):
+    """At 44.1 kHz blocks begin at other times, so only what is heard before the step is compared. The exchange of
+    responses fades in as many steps as a block has samples."""
+
+    def reflected(hz):
+        return heard(AcousticField.load(bundle), hz) - heard(dead(AcousticField.load(bundle)), hz)
+
+    own = reflected(OWN)
+    other = reflected(rate)
+    at_rest_db = signal_to_noise_db(other, rate, own, seconds=SECONDS / 2)
+    assert at_rest_db > (80 if rate == 44_100 else 120)
+    if rate != 44_100:
+        assert signal_to_noise_db(other, rate, own) > 70
+
+
+@pytest.fixture(scope="module")
+def directional(tmp_path_factory):
+    return {
+        tail: AcousticField.load(write_directional(tmp_path_factory.mktemp(tail), towards=(0.6, 0.0, 0.8), tail=tail))
+        for tail in ("stft", "bands")
+    }
+
+
+@pytest.fixture
+def fields(bundle, mirrored_field, field_at_nodes, whole_at_nodes, measured_bundle, directional):
+    return {
+        "without reflections": AcousticField.load(bundle),
+        "mirrored": mirrored_field,
+        "nodes": field_at_nodes,
+        "whole nodes": whole_at_nodes,
+        "measured": AcousticField.load(measured_bundle),
+        **directional,
+    }
+
+
+@pytest.mark.parametrize(
+    "kind", ["without reflections", "mirrored", "nodes", "whole nodes", "measured", "stft", "bands"]
+)
+def test_whole_sound_is_that_of_the_scenes_own_rate(fields, kind):
+    """The heads' filters have the same magnitude and delay, but not quite the same phase near 12 kHz."""
+    own = heard(fields[kind], OWN)
+    assert np.abs(own).max() > 1e-3
+    assert signal_to_noise_db(heard(fields[kind], 48_000), 48_000, own) > 25
+
+
+def test_streams_at_48_and_96_khz_differ_less_than_either_from_24_khz(directional):
+    high, higher = (heard(directional["bands"], rate) for rate in (48_000, 96_000))
+    down = soxr.resample(higher.T, 96_000, 48_000, quality="VHQ").T
+    length = high.shape[1] - 600
+    error = down[:, :length] - high[:, :length]
+    assert 10 * np.log10(np.sum(high[:, :length] ** 2) / np.sum(error**2)) > 48
+
+
+def test_ambisonic_streams_are_those_of_the_scenes_own_rate(directional):
+    own = heard(directional["bands"], OWN, output="ambisonics", order=1)
+    other = heard(directional["bands"], 48_000, output="ambisonics", order=1)
+    assert len(own) == len(other) == 4
+    assert signal_to_noise_db(other, 48_000, own) > 40
+
+
+def test_direct_sound_and_first_reflections_go_beyond_the_scenes_band_and_its_field_does_not(mirrored_bundle):
+    high = clip_at(48_000, low_hz=13_000, high_hz=20_000)
+    whole, direct = (
+        heard(change(AcousticField.load(mirrored_bundle)), 48_000, high) for change in (lambda same: same, dead)
+    )
+    assert np.abs(direct).max() > 1e-4
+    # Before the step: while responses are exchanged, their parts change at different times, and each cut is broad.
+    at_rest = slice(9_000)
+    assert error_db(whole[:, at_rest], direct[:, at_rest]) < -100
+
+
+@RATES
+def test_the_beginning_of_a_response_is_that_of_the_whole(directional, rate):
+    field = FieldsByLevel([directional["bands"]]).at_rate(rate).default
+    (listener, _), emitter = places(field)
+    whole = field.impulse_responses([listener], [emitter], [0.3], remember=True)
+    assert whole.shape == (1, 2, field.ir_samples)
+    first = field.first_samples([listener], [emitter], [0.3], 1_500)
+    np.testing.assert_allclose(first, whole[..., :1_500], atol=1e-6 * np.abs(whole).max())
+
+
+def test_an_offline_render_has_the_samples_of_a_stream(directional):
+    rate, field = 48_000, directional["bands"]
+    (first, second), emitter = places(field)
+    blocks = round(SECONDS / 2 * rate / BLOCKS[rate])
+    path = [
+        PathPoint.at(number * blocks * BLOCKS[rate], Pose.from_yaw(place, 0.5 * (number + 1)))
+        for number, place in enumerate((first, second))
+    ]
+    rendered = render(
+        FieldsByLevel([field]).at_rate(rate).default,
+        DirectSound.of(field.bundle, kemar(rate), field_filters=kemar(OWN)),
+        [RenderedEmitter(clip_at(rate), Pose(emitter))],
+        path,
+        block_size=BLOCKS[rate],
+        length=2 * blocks * BLOCKS[rate],
+    )
+    np.testing.assert_array_equal(rendered, heard(field, rate).astype(np.float32))
+
+
+def test_a_head_of_another_rate_is_no_head_of_a_stream(levels, filters):
+    with pytest.raises(ValueError, match="24000 Hz"):
+        Session(
+            Hello(protocol=PROTOCOL, scene="flat", sample_rate=48_000),
+            levels,
+            filters,
+            lambda _: clip_at(48_000),
+            quality=QualityStep.full(levels.default.level, 1.0),
+        )
