@@ -14,6 +14,8 @@ from typing import get_args
 from fastapi import FastAPI, Response
 from starlette.types import Scope
 
+from server.api.access import Access
+from server.api.access_gate import AccessGate, page_paths
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.connection import StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
@@ -59,6 +61,11 @@ _PAGE_ORDER = ORDERS[0]
 """The order of the ambisonics that the page asks for."""
 WEB = Path(__file__).parents[1] / "web"
 
+_OPEN_TO_ALL = (
+    "WARNING: this server asks for no key, and at %s others can reach it: anybody may use it. Make a key with "
+    "`nafir keys create` and name its file in NAFIR_KEYS_FILE. NAFIR_REQUIRE_AUTH=true refuses to start without"
+)
+
 _logger = logging.getLogger(__name__)
 
 
@@ -75,10 +82,13 @@ def create_app(
     `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already. `peers`
     are the processes of which this is one.
 
-    Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError
-    for a damaged HRTF file.
+    Raises NafirError for files of keys that cannot be used. Without `scenes` or `hrtfs` they are loaded at start-up,
+    which raises BundleError for a damaged bundle and HrtfError for a damaged HRTF file.
     """
     drain = Drain(settings.drain_s) if drain is None else drain
+    access = Access.of(settings, own_key=None if peers is None else peers.key)
+    if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
+        _logger.warning(_OPEN_TO_ALL, settings.host)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
@@ -112,6 +122,7 @@ def create_app(
                 responses=responses,
                 readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
                 peers=peers,
+                access=access,
             )
             if settings.realtime:
                 become_prompt()
@@ -121,6 +132,8 @@ def create_app(
                 asyncio.create_task(host.readiness.watch.run()),
                 asyncio.create_task(host.admission.run()),
             ]
+            if access is not None:
+                tasks.append(asyncio.create_task(access.watch()))
             try:
                 yield {"host": host}
             finally:
@@ -143,10 +156,13 @@ def create_app(
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
-    install_openapi(app)
+    install_openapi(app, is_protected=access is not None)
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
-    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))
-    app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
+    if access is not None:
+        app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
+    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outermost: gives refusals their CORS headers
+    if settings.page:
+        app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
 
 

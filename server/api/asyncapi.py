@@ -20,7 +20,7 @@ from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
 from server.protocol.codecs.registry import CODECS
-from server.protocol.codes import CLOSE_CODES, ERROR_CODES
+from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error, Pong, ServerMessage, Welcome
@@ -69,6 +69,11 @@ in a `hello` is read first; another version is answered `unsupported_protocol`, 
 `welcome`, after which audio flows, or with an `error`, after which the connection ends. A message has at most
 {_default("max_message_bytes")} bytes, and one of more than {_default("max_frame_bytes")} ends the connection. These are
 defaults; an operator may set other limits.
+
+**Keys.** Where the server asks for a key, the handshake carries it as `Authorization: Bearer KEY` or, from a browser,
+as one of the subprotocols: `nafir.key.` and the key in base64url, beside `nafir.v{PROTOCOL}`, which the server chooses.
+Without one it is refused with 401 or 403 and a problem document. A stream ends when its key or token does
+(`key_expired`, `key_revoked`, close code {ACCESS_ENDED}).
 
 **Time.** Blocks are sent when they are due, `buffer_blocks` ahead of real time. `sample_clock` counts samples since the
 start of the stream, sent or skipped. A message with a `sample_clock` takes effect in the block that begins there. Pose

@@ -27,6 +27,8 @@ from typing import Final
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from server.api.access import Access, Caller, Ending
+from server.api.access_gate import caller_of
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
 from server.api.problems import problem
@@ -45,6 +47,7 @@ from server.planning.places import place_of
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.client_messages import (
     AUTO,
+    PROTOCOL,
     AddEmitter,
     ClientMessage,
     Hello,
@@ -56,7 +59,14 @@ from server.protocol.client_messages import (
     parse_client_message,
 )
 from server.protocol.codecs.registry import Encoding
-from server.protocol.codes import INTERNAL_ERROR, NORMAL, POLICY_VIOLATION, SERVICE_RESTART, TRY_AGAIN_LATER
+from server.protocol.codes import (
+    ACCESS_ENDED,
+    INTERNAL_ERROR,
+    NORMAL,
+    POLICY_VIOLATION,
+    SERVICE_RESTART,
+    TRY_AGAIN_LATER,
+)
 from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
@@ -75,6 +85,8 @@ from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
 
 MAX_WAITING_ANSWERS = 256
+SUBPROTOCOL: Final = f"nafir.v{PROTOCOL}"
+"""The subprotocol that is chosen if a client offers it. Browsers close a connection without a choice."""
 _GOODBYE_S = 1.0
 """Limit for sending the close frame. It waits for room in the socket, which a client that does not read never makes."""
 
@@ -107,6 +119,13 @@ _TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", mess
 _DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
 _FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
 
+_EXPIRED: Final = Error(code="key_expired", message="the key or token has expired: connect again with a new one")
+_REVOKED: Final = Error(code="key_revoked", message="the key, or the one that signed the token, was revoked or changed")
+_ENDINGS: Final[Mapping[Ending, Goodbye]] = {
+    "key_expired": Goodbye(ACCESS_ENDED, _EXPIRED),
+    "key_revoked": Goodbye(ACCESS_ENDED, _REVOKED),
+}
+
 
 def _refused(refusal: RequestError) -> Goodbye:
     return Goodbye(POLICY_VIOLATION, Error.from_refusal(refusal))
@@ -114,6 +133,11 @@ def _refused(refusal: RequestError) -> Goodbye:
 
 def _busy(refusal: Refusal) -> Goodbye:
     return Goodbye(TRY_AGAIN_LATER, Error.from_refusal(refusal.error))
+
+
+async def _end_of_access(access: Access, caller: Caller) -> Goodbye:
+    """Return once a client's key or token ends."""
+    return _ENDINGS[await access.ended(caller)]
 
 
 @dataclass
@@ -131,6 +155,8 @@ class StreamHost:
     readiness: Readiness
     peers: ProcessPeers | None = None
     """The processes that serve at one port, if this is one of them."""
+    access: Access | None = None
+    """The keys in force; None if everybody may use the server."""
     offers: dict[str, Offer] = dataclasses.field(default_factory=dict)
     other_offers: dict[tuple[str, int, int | None], Offer] = dataclasses.field(default_factory=dict)
     """The same for streams at another sample rate than the scene's, or of ambisonics: by scene, rate and order, once
@@ -242,7 +268,8 @@ class Connection:
             if (refusal := self._host.turn_away()) is not None:
                 await self._websocket.send_denial_response(refusal)
                 return
-            await self._websocket.accept()
+            offered = self._websocket.scope.get("subprotocols", ())
+            await self._websocket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
             goodbye = await self._serve_until_drained()
             if goodbye is not None:
                 await self._say(goodbye)
@@ -422,6 +449,9 @@ class Connection:
             asyncio.create_task(self._send_outgoing()),
             asyncio.create_task(self._watch(stream)),
         ]
+        access, caller = self._host.access, caller_of(self._websocket.scope)
+        if access is not None and caller is not None:
+            tasks.append(asyncio.create_task(_end_of_access(access, caller)))
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:

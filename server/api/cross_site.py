@@ -24,14 +24,14 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.connection_limits import HEALTH_PATHS
-from server.api.problems import Refusal, problem
+from server.api.problems import Refusal, problem, refuse
 from server.api.settings import Settings
 
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
-_EXPOSED = ("ETag", "Retry-After")
-_METHODS = ("GET", "HEAD", "POST")
-_HEADERS = ("Content-Type", "If-None-Match")
+_EXPOSED = ("ETag", "Retry-After", "WWW-Authenticate")
+_METHODS = ("GET", "HEAD", "POST", "DELETE")
+_HEADERS = ("Authorization", "Content-Type", "If-None-Match", "Range")
 _DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
 _FOR_PROGRAMS = ("/v1/", "/metrics")
 """Paths for programs, to which no link of a page leads."""
@@ -52,7 +52,7 @@ class SitePolicy:
         return cls(
             hosts=frozenset(hosts),
             origins=frozenset(origin.lower().rstrip("/") for origin in settings.allowed_origins),
-            is_loopback=_is_loopback(settings.host),
+            is_loopback=settings.is_loopback,
         )
 
     def refusal(self, path: str, headers: Headers, *, scheme: str = "http") -> Refusal | None:
@@ -110,11 +110,8 @@ class CrossSiteGate:
         refusal = self._policy.refusal(scope["path"], Headers(scope=scope), scheme=scope.get("scheme", "http"))
         if refusal is None:
             await self._app(scope, receive, _varying(send) if self._policy.origins else send)
-        elif scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
-            # A close before acceptance answers the upgrade with 403 and no body.
-            await send({"type": "websocket.close", "code": 1008, "reason": refusal.code})
         else:
-            await problem(refusal.status, refusal.code, refusal.detail)(scope, receive, send)
+            await refuse(refusal, scope, receive, send)
 
 
 class _Cors(CORSMiddleware):
@@ -174,11 +171,6 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(name)
     except ValueError:
         return None
-
-
-def _is_loopback(host: str) -> bool:
-    address = _address(host)
-    return host.lower() == "localhost" or (address is not None and address.is_loopback)
 
 
 def _varying(send: Send) -> Send:

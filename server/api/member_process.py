@@ -32,7 +32,7 @@ def _serve(told: dict[str, Any]) -> None:
 
     from server.api import serving
     from server.api.member_server import MemberServer
-    from server.api.process_peers import ProcessPeers
+    from server.api.process_peers import KEY_VARIABLE, ProcessPeers
     from server.api.settings import checked_settings
     from server.api.start import loaded_app
     from server.runtime.drain import Drain
@@ -41,7 +41,8 @@ def _serve(told: dict[str, Any]) -> None:
     give_back_large_arrays()
     settings = checked_settings(told["options"])
     drain = Drain(settings.drain_s)
-    peers = ProcessPeers(told["number"], tuple(told["ports"]))
+    # Not among the arguments, which other users of the machine can see.
+    peers = ProcessPeers(told["number"], tuple(told["ports"]), os.environ.pop(KEY_VARIABLE, None))
     with (
         socket.socket(fileno=told["channel"]) as channel,
         socket.socket(fileno=told["own"]) as own,

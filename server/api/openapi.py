@@ -5,6 +5,9 @@ from typing import Any, Final
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from server.api.access_gate import scopes_for
+from server.api.api_keys import SCOPES
+from server.api.connection_limits import HEALTH_PATHS
 from server.api.problem_codes import PROBLEM_CODES
 from server.responses.response_batch import ResponseBatch
 
@@ -49,18 +52,30 @@ _COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/pl
 _TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder")
 
 
-def install_openapi(app: FastAPI) -> None:
+_NO_KEY: Final[Object] = {
+    "401": "The request has no key, or one that is not valid now. Only where the server asks for keys.",
+    "403": "The key has not the scope for this, the request comes from another site, or the server refuses it.",
+}
+_KEY: Final[Object] = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "An API key, or a JSON Web Token with the scope in `scope`.",
+}
+
+
+def install_openapi(app: FastAPI, *, is_protected: bool = False) -> None:
     """Make the application's OpenAPI document the one from `describe`, computed once."""
 
     def openapi() -> Object:
         if app.openapi_schema is None:
-            app.openapi_schema = describe(app)
+            app.openapi_schema = describe(app, is_protected=is_protected)
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]  # as FastAPI's documentation has it
 
 
-def describe(app: FastAPI) -> Object:
+def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
+    """The document. With `is_protected` it says which operations need a key, and of what scopes one."""
     document: Object = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -69,11 +84,18 @@ def describe(app: FastAPI) -> Object:
     batch = ResponseBatch.model_json_schema(ref_template="#/components/schemas/{model}")
     schemas |= batch.pop("$defs")
     schemas[ResponseBatch.__name__] = batch
+    if is_protected:
+        document["components"]["securitySchemes"] = {"key": _KEY}
     for path, operations in document["paths"].items():
-        for operation in operations.values():
+        for method, operation in operations.items():
+            if is_protected and path not in HEALTH_PATHS:
+                needed = scopes_for(method.upper(), path)
+                operation["security"] = [{"key": [scope]} for scope in SCOPES if scope in needed]
             for parameter in operation.get("parameters", ()):
                 parameter["schema"] = _without_null(parameter["schema"])
             operation["responses"] |= _refusals(path, has_body="requestBody" in operation)
+            if "security" in operation:
+                operation["responses"] |= _described(_NO_KEY)
             if path.endswith(_TAGGED):
                 operation["responses"]["304"] = {"description": "The client has it already, by its `If-None-Match`."}
     return document
@@ -89,10 +111,14 @@ def _refusals(path: str, *, has_body: bool) -> Object:
         refused |= _OF_A_HEAD
     if path.endswith(_COMPUTED):
         refused |= _OF_A_COMPUTATION
-    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    responses: Object = {status: {"description": text, "content": content} for status, text in sorted(refused.items())}
+    responses = _described(refused)
     responses["503"] |= {"headers": {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}}
     return responses
+
+
+def _described(refused: Object) -> Object:
+    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"description": text, "content": content} for status, text in sorted(refused.items())}
 
 
 def _without_null(schema: Object) -> Object:

@@ -7,8 +7,10 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
 
 from server.core.errors import RequestError
+from server.protocol.codes import POLICY_VIOLATION
 
 _POSE_PARAMETERS = frozenset({"listener", "emitter", "yaw_deg", "pitch_deg", "roll_deg", "orientation", "height_m"})
 _STATUSES = {"position_out_of_bounds": 404, "unknown_level": 404, "map_too_fine": 409, "map_too_slow": 409}
@@ -25,6 +27,18 @@ class Refusal:
     status: int
     code: str
     detail: str
+    headers: tuple[tuple[str, str], ...] = ()
+
+
+async def refuse(refusal: Refusal, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a request or a WebSocket handshake by a refusal."""
+    if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
+        # A close before acceptance answers the upgrade with 403 and no body.
+        await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": refusal.code})
+        return
+    response = problem(refusal.status, refusal.code, refusal.detail)
+    response.headers.update(dict(refusal.headers))
+    await response(scope, receive, send)
 
 
 def problem(

@@ -3,7 +3,7 @@
 import http.client
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily
@@ -14,15 +14,19 @@ from prometheus_client.samples import Sample
 
 OWN_METRICS = "/metrics/process"
 """Where a process answers with its own metrics only."""
+KEY_VARIABLE = "_NAFIR_PEERS_KEY"
+"""The variable in the environment that tells a process the key of its peers."""
 _PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True)
 class ProcessPeers:
-    """A process of a server: its `number`, and at which port of the loopback interface each of them answers."""
+    """A process of a server: its `number`, at which port of the loopback interface each of them answers, and the `key`
+    that they ask each other with."""
 
     number: int
     ports: tuple[int, ...]
+    key: str | None = field(default=None, repr=False)
 
     def gather(self, own: bytes) -> bytes:
         """The metrics of all processes, with the label `process`; `own` are those of this one. A process that does not
@@ -35,7 +39,8 @@ class ProcessPeers:
     def _ask(self, number: int) -> bytes | None:
         connection = http.client.HTTPConnection("127.0.0.1", self.ports[number], timeout=_PATIENCE_S)
         try:
-            connection.request("GET", OWN_METRICS)
+            headers = {} if self.key is None else {"Authorization": f"Bearer {self.key}"}
+            connection.request("GET", OWN_METRICS, headers=headers)
             answer = connection.getresponse()
             return answer.read() if answer.status == http.client.OK else None
         except (OSError, http.client.HTTPException):

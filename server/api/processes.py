@@ -19,6 +19,7 @@ import contextlib
 import json
 import logging
 import math
+import os
 import selectors
 import signal
 import socket
@@ -32,6 +33,8 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
+from server.api.api_keys import random_key
+from server.api.process_peers import KEY_VARIABLE
 from server.core.errors import NafirError
 
 COMMAND = sys.executable, "-m", "server.api.member_process"
@@ -130,6 +133,7 @@ class ProcessGroup:
         self._drain_s = drain_s
         self._command = command
         self._own = [listening_privately() for _ in shares]
+        self._key, _ = random_key()
         self._members: dict[int, Member] = {}
         self._selector = selectors.DefaultSelector()
         self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
@@ -188,6 +192,7 @@ class ProcessGroup:
                 [*self._command, json.dumps(told)],
                 pass_fds=descriptors,
                 process_group=0,
+                env={**os.environ, KEY_VARIABLE: self._key},
                 stdin=subprocess.DEVNULL,
             )
         member = self._members[number] = Member(number, process, ours)

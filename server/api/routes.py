@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
+from server.api.access_gate import caller_of
 from server.api.asyncapi import document
 from server.api.catalogue import describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
@@ -101,9 +102,13 @@ async def livez() -> dict[str, str]:
 
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
-    """Answers 200 if streams may be opened: the server is warmed up, its threads work, and it is not shutting down."""
-    if (obstacle := _host(request).readiness.obstacle) is not None:
-        raise RequestError(obstacle.code, obstacle.message, status=503, retry_after_s=obstacle.retry_after_s)
+    """Answers 200 if streams may be opened: the server is warmed up, its threads work, and it is not shutting down.
+    Where keys are needed, only who has one with the scope `admin` is told what is wrong."""
+    host = _host(request)
+    if (obstacle := host.readiness.obstacle) is not None:
+        is_told = host.access is None or caller_of(request.scope) is not None
+        message = obstacle.message if is_told else "the server is not ready"
+        raise RequestError(obstacle.code, message, status=503, retry_after_s=obstacle.retry_after_s)
     return {"status": "ready"}
 
 

@@ -1,5 +1,6 @@
 """Settings of the server, given by arguments or by environment variables that begin with NAFIR_."""
 
+import ipaddress
 import os
 import re
 from collections.abc import Mapping
@@ -81,6 +82,21 @@ class Settings(BaseSettings):
     """Host names that the server answers to, besides `host`, localhost and numeric addresses; `*` allows any."""
     allowed_origins: Origins = ()
     """Sites whose pages may use the server, such as https://example.org. The server's own page always may."""
+    keys_file: Path | None = None
+    """File of API keys, made by `nafir keys create`. With it, or with `jwt_keys_file`, whoever uses the server needs a
+    key or a token. It is read again when it changes."""
+    jwt_keys_file: Path | None = None
+    """JSON Web Key Set with the keys that tokens (JWT) are signed by. It is read again when it changes."""
+    jwt_audience: str | None = None
+    """The audience (`aud`) that tokens have to be for; `jwt_keys_file` needs it."""
+    jwt_issuer: str | None = None
+    """The issuer (`iss`) that tokens have to be from; by default any whose key is in `jwt_keys_file`."""
+    jwt_leeway_s: Annotated[float, Field(ge=0, le=300)] = 10.0
+    """By how much the clocks of the server and of a token's issuer may differ."""
+    require_auth: bool = False
+    """Whether the server refuses to start without keys. Without it, one that others can reach warns."""
+    page: bool = True
+    """Whether the server has a page. Its files need no key."""
     bundles: Paths = ()
     """Scene bundles to serve besides those that come with the package."""
     clips: NamedFiles = ()
@@ -158,6 +174,21 @@ class Settings(BaseSettings):
             return parse_decimal(value) if float in kinds else parse_integer(value)
         return value
 
+    @property
+    def is_loopback(self) -> bool:
+        """Whether `host` stands for this machine alone."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host.lower() == "localhost"
+
+    @model_validator(mode="after")
+    def _knows_whom_tokens_are_for(self) -> Self:
+        """Tokens for other services of the same issuer must not open this one."""
+        if self.jwt_keys_file is not None and not self.jwt_audience:
+            raise PydanticCustomError("audience", "jwt_keys_file needs jwt_audience: name whom tokens have to be for")
+        return self
+
     @model_validator(mode="after")
     def _knows_the_environment(self) -> Self:
         """Refuse misspelt variables, which would otherwise have no effect."""
@@ -190,5 +221,8 @@ def checked_settings(given: Mapping[str, Any]) -> Settings:
     allow_connections(settings.max_connections)
     for name in ("clips", "hrtfs"):
         for path in getattr(settings, name):
+            require_readable(path, name)
+    for name in ("keys_file", "jwt_keys_file"):
+        if (path := getattr(settings, name)) is not None:
             require_readable(path, name)
     return settings

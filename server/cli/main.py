@@ -17,6 +17,7 @@ import typer
 
 from server.bench import cli as bench
 from server.bench.capacity_cli import plan_capacity
+from server.cli import keys
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
 from server.core.errors import NafirError, RequestError
 from server.core.files import require_readable
@@ -43,6 +44,7 @@ app = StrictTyper(
     rich_markup_mode="rich",
 )
 app.add_typer(bench.app, name="bench")
+app.add_typer(keys.app, name="keys")
 app.command()(plan_capacity)
 app.command()(check)
 app.command()(soak)

@@ -5,10 +5,14 @@ from typing import Final
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 """Close codes of RFC 6455, section 7.4.1, that the server uses."""
+ACCESS_ENDED = 4401
+"""A close code of our own (RFC 6455, 7.4.2): 401 for a stream that is open."""
 
 ERROR_CODES: Final[Mapping[str, str]] = {
     "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",
     "server_draining": "the server is shutting down; open the stream again, there or elsewhere",
+    "key_expired": "the key or token that opened the stream has expired; connect again with a new one",
+    "key_revoked": "the key that opened the stream, or signed its token, was revoked; connect again with a valid one",
     "server_busy": "the stream, emitter, level or effect would break somebody's sound, or no stream is free; ask later",
     "hello_expected": "the first message was not a hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
@@ -55,5 +59,6 @@ CLOSE_CODES: Final[Mapping[int, str]] = {
     INTERNAL_ERROR: "the stream failed because of a defect of the server",
     SERVICE_RESTART: "the server is shutting down",
     TRY_AGAIN_LATER: "the server is not ready, or has no room for the stream",
+    ACCESS_ENDED: "the key or token that opened the stream has expired or was revoked",
 }
 """Meanings by close code. The web server itself closes with 1002, 1007 and 1009."""

@@ -142,7 +142,7 @@ def test_a_named_site_may_read_answers_with_their_tags(client):
 @pytest.mark.parametrize(
     "asked",
     [
-        {"Access-Control-Request-Method": "DELETE"},
+        {"Access-Control-Request-Method": "PATCH"},
         {"Access-Control-Request-Method": "GET", "Access-Control-Request-Headers": "X-Own"},
     ],
 )

@@ -1,0 +1,438 @@
+"""Who may use a server that asks for keys."""
+
+import asyncio
+import base64
+import json
+import os
+import time
+
+import pytest
+from fastapi.routing import iter_route_contexts
+from starlette.testclient import TestClient, WebSocketDenialResponse
+
+from server.api import access as access_module
+from server.api.access import Access
+from server.api.access_gate import KEY_PROTOCOL, scopes_for
+from server.api.api_keys import SCOPES, create_key, revoke_key
+from server.api.app import WEB, create_app
+from server.api.connection import SUBPROTOCOL
+from server.api.process_peers import OWN_METRICS, ProcessPeers
+from server.api.settings import Settings, settings_of
+from server.core.errors import NafirError
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.client_messages import PROTOCOL, Hello
+from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES
+from server.protocol.server_messages import Error, Welcome, parse_server_message
+from tests.api.token_keys import AUDIENCE, KEY_SET, token
+
+HELLO = Hello(protocol=PROTOCOL, scene="flat")
+IR = "/v1/scenes/flat/impulse-response?listener=1,2,1.5&emitter=6,3,1.5"
+PEERS_KEY = "nafir_aaaaaaaaaaaa_of-the-processes"
+
+
+def bearer(key):
+    return {"Authorization": f"Bearer {key}"}
+
+
+def protocols(key, *, chosen=SUBPROTOCOL):
+    encoded = base64.urlsafe_b64encode(key.encode()).rstrip(b"=").decode()
+    return [chosen, f"{KEY_PROTOCOL}{encoded}"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("keys")
+    (folder / "jwks.json").write_text(json.dumps(KEY_SET))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def keys(folder):
+    """A key of each scope, by the scope."""
+    return {scope: create_key(folder / "keys.json", scope, [scope], None)[0] for scope in SCOPES}
+
+
+@pytest.fixture(scope="module")
+def client(bundle, hrtfs, folder, keys):
+    assert len(keys) == len(SCOPES)  # they are in the file
+    settings = Settings(
+        keys_file=folder / "keys.json",
+        jwt_keys_file=folder / "jwks.json",
+        jwt_audience=AUDIENCE,
+        jwt_leeway_s=0,
+        allowed_origins=("https://game.example",),
+    )
+    scenes = {"flat": FieldsByLevel.load(bundle)}
+    peers = ProcessPeers(0, (1,), PEERS_KEY)
+    app = create_app(settings, scenes=scenes, hrtfs=hrtfs, peers=peers)
+    with TestClient(app, base_url="http://localhost:8000") as client:
+        while client.get("/readyz").status_code != 200:
+            time.sleep(0.05)
+        yield client
+
+
+def paths(app):
+    """The path of every route, parameters filled in, with its methods; none are a WebSocket's."""
+    for context in iter_route_contexts(app.router.routes):
+        path = getattr(context, "path", None)
+        if path:
+            filled = path.replace("{scene}", "flat").replace("{hrtf}", "kemar").replace("{path:path}", "")
+            yield filled, frozenset(getattr(context, "methods", None) or ())
+
+
+def check_refused(answer, status, code):
+    assert answer.status_code == status, answer.url
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    assert answer.json()["code"] == code
+    assert answer.headers["WWW-Authenticate"].startswith('Bearer realm="nafir"')
+
+
+def test_an_outsider_gets_nothing_but_health_and_the_page(client):
+    """Every route is tried, with every method: one that is added later is closed unless somebody opens it."""
+    tried = set()
+    for path, methods in paths(client.app):
+        for method in methods | {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}:
+            if path in {"/livez", "/readyz", "/"} or path == "":
+                continue
+            for given in (
+                {},
+                bearer("nafir_000000000000_wrong"),
+                bearer(token(exp=1)),
+                {"Authorization": "Basic eDp5"},
+            ):
+                answer = client.request(method, path, headers=given)
+                assert answer.status_code == 401, (method, path)
+                assert method == "HEAD" or answer.json()["code"] in {"key_required", "key_refused"}
+            tried.add(path)
+    assert {"/v1/stream", "/v1/scenes", "/metrics", OWN_METRICS, "/openapi.json", "/docs", "/asyncapi.json"} <= tried
+    for path in ("/v2", "/nothing", "/livez/", "/livez/x", "/livez%00", "/%6divez", "/metrics%20", "/V1/scenes"):
+        assert client.get(path, follow_redirects=False).status_code == 401, path
+    assert client.get("/livez").status_code == client.get("/readyz").status_code == 200
+    for file in WEB.rglob("*"):
+        if file.is_file():
+            assert client.get(f"/{file.relative_to(WEB).as_posix()}").status_code == 200
+    assert client.get("/").status_code == 200
+
+
+def test_a_key_in_the_query_opens_nothing(client, keys):
+    for name in ("key", "token", "access_token", "api_key"):
+        check_refused(client.get("/v1/scenes", params={name: keys["listen"]}), 401, "key_required")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "scopes"),
+    [
+        ("GET", "/v1/scenes", {"listen", "render"}),
+        ("HEAD", "/v1/scenes/flat", {"listen", "render"}),
+        ("GET", "/v1/scenes/flat/frontier", {"listen", "render"}),
+        ("GET", "/v1/scenes/flat/impulse-response", {"render"}),
+        ("GET", "/v1/scenes/flat/loudness", {"render"}),
+        ("GET", "/v1/scenes/flat/plan", {"render"}),
+        ("POST", "/v1/scenes/flat/impulse-responses", {"render"}),
+        ("GET", "/v1/clips", {"listen", "upload"}),
+        ("POST", "/v1/clips", {"upload"}),
+        ("DELETE", "/v1/clips/abc", {"upload"}),
+        ("GET", "/v1/hrtfs/kemar/decoder", {"listen", "render"}),
+        ("GET", "/v1/stream", {"listen"}),
+        ("GET", "/openapi.json", set(SCOPES)),
+        ("GET", "/metrics", {"admin"}),
+        ("GET", OWN_METRICS, {"admin"}),
+        ("GET", "/anything/new", {"admin"}),
+        ("POST", "/v1/scenes", {"admin"}),
+        ("DELETE", "/v1/scenes/flat", {"admin"}),
+        ("GET", "/v1/scenes\n", {"admin"}),
+    ],
+)
+def test_every_path_has_its_scope(method, path, scopes):
+    assert scopes_for(method, path) == scopes
+
+
+def test_a_key_does_what_its_scope_says_and_nothing_else(client, keys):
+    for path, method in (("/v1/scenes", "GET"), (IR, "GET"), ("/v1/clips", "POST"), ("/metrics", "GET")):
+        needed = scopes_for(method, path.partition("?")[0])
+        for scope, key in keys.items():
+            answer = client.request(method, path, headers=bearer(key))
+            if scope in needed:
+                assert answer.status_code not in {401, 403}, (scope, path)
+            else:
+                check_refused(answer, 403, "scope_missing")
+                assert 'error="insufficient_scope"' in answer.headers["WWW-Authenticate"]
+    assert client.get(IR, headers=bearer(keys["render"])).status_code == 200
+
+
+def test_a_token_does_what_its_scopes_say(client):
+    for algorithm in ("HS256", "RS256", "ES256"):
+        assert client.get(IR, headers=bearer(token(algorithm))).status_code == 200
+    check_refused(client.get("/metrics", headers=bearer(token())), 403, "scope_missing")
+    assert client.get("/metrics", headers=bearer(token(scope="openid admin"))).status_code == 200
+    check_refused(client.get("/v1/scenes", headers=bearer(token(scope=""))), 403, "scope_missing")
+    refused = client.get(IR, headers=bearer(token(aud="another")))
+    check_refused(refused, 401, "key_refused")
+    assert "audience" in refused.json()["detail"]
+
+
+def test_a_key_comes_once(client, keys):
+    key = keys["listen"]
+    twice = client.get("/v1/scenes", headers=[("Authorization", f"Bearer {key}"), ("Authorization", "Bearer x")])
+    assert (twice.status_code, twice.json()["code"]) == (400, "doubled_header")
+    with (
+        pytest.raises(WebSocketDenialResponse) as refused,
+        client.websocket_connect("/v1/stream", headers=bearer(key), subprotocols=protocols(key)),
+    ):
+        pass
+    assert refused.value.status_code == 400
+    for scheme in ("bearer", "BEARER", "Bearer  "):
+        assert client.get("/v1/scenes", headers={"Authorization": f"{scheme} {key}"}).status_code == 200
+
+
+def opened(client, **options):
+    """What a hello is answered on a stream."""
+    with client.websocket_connect("/v1/stream", **options) as socket:
+        socket.send_text(HELLO.serialize())
+        return parse_server_message(socket.receive_text()), socket.accepted_subprotocol
+
+
+def test_a_stream_opens_by_header_and_by_subprotocol(client, keys):
+    welcome, chosen = opened(client, headers=bearer(keys["listen"]))
+    assert isinstance(welcome, Welcome)
+    assert chosen is None
+    for key in (keys["listen"], token()):
+        welcome, chosen = opened(client, subprotocols=protocols(key))
+        assert isinstance(welcome, Welcome)
+        assert chosen == SUBPROTOCOL
+
+
+def test_a_stream_is_refused_before_it_opens(client, keys):
+    wrong = [f"{KEY_PROTOCOL}{text}" for text in ("", "=", "%", "bmFmaXI", "A" * 4_000)]
+    tries = (
+        ({}, 401, "key_required"),
+        ({"subprotocols": [SUBPROTOCOL]}, 401, "key_required"),
+        *(({"subprotocols": [SUBPROTOCOL, each]}, 401, "key_refused") for each in wrong),
+        ({"subprotocols": protocols(keys["render"])}, 403, "scope_missing"),
+        ({"headers": bearer(token(exp=1))}, 401, "key_refused"),
+    )
+    for options, status, code in tries:
+        with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect("/v1/stream", **options):
+            pass
+        check_refused(refused.value, status, code)
+
+
+def test_another_sites_page_opens_no_stream_even_with_a_key(client, keys):
+    for origin, status in (("https://evil.example", 403), ("null", 403), ("http://localhost:3000", 403)):
+        with (
+            pytest.raises(WebSocketDenialResponse) as refused,
+            client.websocket_connect(
+                "ws://localhost:8000/v1/stream", headers={"Origin": origin}, subprotocols=protocols(keys["listen"])
+            ),
+        ):
+            pass
+        assert (refused.value.status_code, refused.value.json()["code"]) == (status, "origin_not_allowed")
+    welcome, _ = opened(client, headers={"Origin": "https://game.example"}, subprotocols=protocols(keys["listen"]))
+    assert isinstance(welcome, Welcome)
+
+
+def test_pages_of_named_sites_may_send_keys_and_read_why_they_are_refused(client, keys):
+    site = {"Origin": "https://game.example"}
+    for method, header in (("GET", "Authorization"), ("POST", "Content-Type"), ("DELETE", "Authorization")):
+        asked = {"Access-Control-Request-Method": method, "Access-Control-Request-Headers": header}
+        preflight = client.options("/v1/clips", headers={**site, **asked})
+        assert preflight.status_code == 200
+        assert header.lower() in preflight.headers["Access-Control-Allow-Headers"].lower()
+        assert method in preflight.headers["Access-Control-Allow-Methods"]
+    answer = client.get("/v1/scenes", headers=site)
+    check_refused(answer, 401, "key_required")
+    assert answer.headers["Access-Control-Allow-Origin"] == site["Origin"]
+    assert "WWW-Authenticate" in answer.headers["Access-Control-Expose-Headers"]
+    assert client.get("/v1/scenes", headers={**site, **bearer(keys["listen"])}).status_code == 200
+
+
+def closed_with(socket):
+    """The last error of a stream and its close code."""
+    error = None
+    while (event := socket.receive())["type"] != "websocket.close":
+        if event.get("text") is not None:
+            message = parse_server_message(event["text"])
+            error = message if isinstance(message, Error) else error
+    assert error is not None
+    assert event["reason"] == error.code
+    return error.code, event["code"]
+
+
+def test_a_stream_ends_when_its_token_expires(client):
+    expires_s = int(time.time()) + 2
+    with client.websocket_connect("/v1/stream", headers=bearer(token(exp=expires_s))) as socket:
+        socket.send_text(HELLO.serialize())
+        assert closed_with(socket) == ("key_expired", ACCESS_ENDED)
+        assert 0 <= time.time() - expires_s < 2
+
+
+def test_a_stream_ends_when_its_key_is_revoked_and_others_go_on(client, folder, keys):
+    key, entry = create_key(folder / "keys.json", "leaving", ["listen"], None)
+    wait_until(lambda: client.get("/v1/scenes", headers=bearer(key)).status_code == 200)
+    with (
+        client.websocket_connect("/v1/stream", headers=bearer(key)) as leaving,
+        client.websocket_connect("/v1/stream", headers=bearer(keys["listen"])) as staying,
+    ):
+        for socket in (leaving, staying):
+            socket.send_text(HELLO.serialize())
+            assert isinstance(parse_server_message(socket.receive_text()), Welcome)
+        revoke_key(folder / "keys.json", entry.id)
+        assert closed_with(leaving) == ("key_revoked", ACCESS_ENDED)
+        staying.send_text('{"type": "ping", "id": 7}')
+        while '"pong"' not in (staying.receive().get("text") or ""):
+            pass
+    check_refused(client.get("/v1/scenes", headers=bearer(key)), 401, "key_refused")
+
+
+def test_a_stream_ends_when_the_key_of_its_token_leaves_the_set(client, folder):
+    file = folder / "jwks.json"
+    with client.websocket_connect("/v1/stream", headers=bearer(token("ES256"))) as socket:
+        socket.send_text(HELLO.serialize())
+        assert isinstance(parse_server_message(socket.receive_text()), Welcome)
+        file.write_text(json.dumps({"keys": [key for key in KEY_SET["keys"] if key["alg"] != "ES256"]}))
+        assert closed_with(socket) == ("key_revoked", ACCESS_ENDED)
+    assert client.get("/v1/scenes", headers=bearer(token("RS256"))).status_code == 200
+    file.write_text(json.dumps(KEY_SET))
+    wait_until(lambda: client.get("/v1/scenes", headers=bearer(token("ES256"))).status_code == 200)
+
+
+def wait_until(holds):
+    deadline = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_the_code_of_every_end_of_access_is_described():
+    assert ACCESS_ENDED in CLOSE_CODES
+    assert {"key_expired", "key_revoked"} <= ERROR_CODES.keys()
+
+
+def test_the_document_says_what_needs_a_key(client, keys):
+    document = client.get("/openapi.json", headers=bearer(keys["listen"])).json()
+    assert document["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            assert ("security" in operation) == (path not in {"/livez", "/readyz"})
+    response = document["paths"]["/v1/scenes/{scene}/impulse-response"]["get"]
+    assert response["security"] == [{"key": ["render"]}]
+    assert "401" in response["responses"]
+
+
+def test_the_processes_of_a_server_ask_each_other_with_a_key_of_their_own(client):
+    assert client.get(OWN_METRICS, headers=bearer(PEERS_KEY)).status_code == 200
+    check_refused(client.get("/v1/scenes", headers=bearer(PEERS_KEY)), 403, "scope_missing")
+    assert PEERS_KEY not in repr(ProcessPeers(0, (1,), PEERS_KEY))
+
+
+def test_only_an_operator_is_told_why_a_server_is_not_ready(client, keys):
+    drain = client.app_state["host"].readiness
+    before, drain.warm_up = drain.warm_up, "failed"
+    try:
+        told, outsider = (client.get("/readyz", headers=given).json() for given in (bearer(keys["admin"]), {}))
+    finally:
+        drain.warm_up = before
+    assert told["code"] == outsider["code"] == "not_ready"
+    assert outsider["detail"] == "the server is not ready"
+    assert told["detail"] != outsider["detail"]
+
+
+# Files that change.
+
+
+def test_a_file_that_becomes_unreadable_changes_nothing_and_is_told_once(tmp_path, caplog):
+    file = tmp_path / "keys.json"
+    key, _ = create_key(file, "", ["listen"], None)
+    access = Access.of(Settings(keys_file=file))
+    good = file.read_text()
+    for harm in (lambda: file.write_text("{"), file.unlink):
+        harm()
+        with caplog.at_level("ERROR", access_module.__name__):
+            caplog.clear()
+            asyncio.run(access.refresh())
+            asyncio.run(access.refresh())
+        assert access.admit(key).scopes == {"listen"}
+        assert len(caplog.records) == 1
+        assert str(file) in caplog.text
+    file.write_text(good.replace(key.split("_")[1], "0" * 12))
+    asyncio.run(access.refresh())
+    with pytest.raises(access_module.AccessError):
+        access.admit(key)
+
+
+def test_a_change_that_keeps_size_and_time_is_seen(tmp_path):
+    """As a file that is replaced, in the way `nafir keys` and Kubernetes do it."""
+    file, other = tmp_path / "keys.json", tmp_path / "new.json"
+    (first, _), (second, _) = (create_key(each, "", ["listen"], None) for each in (file, other))
+    access = Access.of(Settings(keys_file=file))
+    stat = file.stat()
+    os.utime(other, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    other.replace(file)
+    asyncio.run(access.refresh())
+    assert access.admit(second)
+    with pytest.raises(access_module.AccessError, match="no such key"):
+        access.admit(first)
+
+
+def test_a_key_that_has_expired_or_changed_admits_nobody(tmp_path):
+    file = tmp_path / "keys.json"
+    key, _ = create_key(file, "", ["listen"], None)
+    now_s = 1_000.0
+    document = json.loads(file.read_text())
+    document["keys"][0]["expires"] = "1970-01-01T00:20:00Z"
+    file.write_text(json.dumps(document))
+    access = Access(read_keys=lambda: access_module.ApiKeys.read(file), files=(file,), time_s=lambda: now_s)
+    caller = access.admit(key)
+    assert access.ending(caller) is None
+    now_s = 1_200.0
+    assert access.ending(caller) == "key_expired"
+    with pytest.raises(access_module.AccessError, match="expired"):
+        access.admit(key)
+    now_s = 1_000.0
+    document["keys"][0]["scopes"] = ["upload"]
+    file.write_text(json.dumps(document))
+    asyncio.run(access.refresh())
+    assert access.ending(caller) == "key_revoked"
+
+
+# Settings.
+
+
+@pytest.fixture
+def warnings_of_start(caplog):
+    def start(**settings):
+        with caplog.at_level("WARNING"):
+            caplog.clear()
+            create_app(Settings(**settings), scenes={})
+        return caplog.text
+
+    return start
+
+
+def test_a_server_that_others_reach_without_a_key_warns(warnings_of_start, tmp_path):
+    create_key(tmp_path / "keys.json", "", ["listen"], None)
+    for host in ("0.0.0.0", "::", "192.168.0.5", "sound.example", ""):
+        assert "anybody may use it" in warnings_of_start(host=host)
+        assert warnings_of_start(host=host, keys_file=tmp_path / "keys.json") == ""
+    for host in ("127.0.0.1", "localhost", "::1", "127.1.2.3"):
+        assert warnings_of_start(host=host) == ""
+
+
+def test_a_server_that_has_to_ask_for_keys_does_not_start_without(tmp_path):
+    for host in ("127.0.0.1", "0.0.0.0"):
+        with pytest.raises(NafirError, match="NAFIR_KEYS_FILE"):
+            create_app(Settings(host=host, require_auth=True), scenes={})
+    create_key(tmp_path / "keys.json", "", ["listen"], None)
+    create_app(Settings(host="0.0.0.0", require_auth=True, keys_file=tmp_path / "keys.json"), scenes={})
+
+
+def test_tokens_need_an_audience(tmp_path):
+    with pytest.raises(NafirError, match="jwt_audience"):
+        settings_of({"jwt_keys_file": tmp_path / "jwks.json"})
+
+
+def test_a_server_without_a_page_shows_none(tmp_path):
+    create_key(tmp_path / "keys.json", "", ["listen"], None)
+    client = TestClient(create_app(Settings(page=False, keys_file=tmp_path / "keys.json"), scenes={}))
+    for path in ("/", "/index.html", "/main.js"):
+        assert client.get(path, headers={"Host": "localhost"}).status_code == 401
