@@ -280,6 +280,7 @@ ELSEWHERE = {
     "main.py",
     "plan_query.py",
     "problems.py",
+    "response_batch.py",
     "routes.py",
 }
 
