@@ -2,6 +2,7 @@
 // and the keyboard.
 
 import { Comparison } from "./comparison.js";
+import { askForKey, key } from "./access.js";
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
@@ -427,7 +428,7 @@ class Page {
     };
     if (this.output === "ambisonics") this.#listenWithHead();
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
-    this.#tell("open", { url: streamUrl(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
+    this.#tell("open", { url: streamUrl(), key: key(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
 
   async pause() {
@@ -468,7 +469,7 @@ class Page {
 
   #streamState(detail) {
     if (!this.playing) return;
-    const { state, attempt, retryMs, reason, isBusy } = detail;
+    const { state, attempt, retryMs, reason, isBusy, needsKey } = detail;
     if (state === "connecting" && attempt === 0) {
       this.#setConnection("connecting", "Connecting");
       this.#blank();
@@ -491,12 +492,13 @@ class Page {
         this.notices.show("connection", `The server has no room for another listener. Trying again in ${seconds} s.`, { lasting: true });
       } else if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
     } else if (state === "refused") {
-      this.notices.show("connection", reason, { lasting: true });
+      if (!needsKey) this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);
-      this.player.pause();
+      const paused = this.player.pause();
       this.output = null;
       this.#blank();
-      this.#setConnection("refused", "Refused");
+      this.#setConnection("refused", needsKey ? "Needs a key" : "Refused");
+      if (needsKey) Promise.all([askForKey(reason), paused]).then(() => this.play());
     }
   }
 

@@ -1,6 +1,9 @@
 // Requests to the server over HTTP: scenes, clips, heads and loudness maps. Problem documents become RequestError.
 
+import { askForKey, authorized, key } from "./access.js";
+
 const endpoint = (path) => new URL(`v1/${path}`, document.baseURI);
+const NEEDS_KEY = 401;
 
 export class RequestError extends Error {
   constructor(message, { code = "unreachable", status = 0 } = {}) {
@@ -11,15 +14,20 @@ export class RequestError extends Error {
 }
 
 async function getJson(url, options) {
+  const given = key();
   let response;
   try {
-    response = await fetch(url, options);
+    response = await fetch(url, authorized(options, given));
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new RequestError("The server cannot be reached.");
   }
   if (response.ok) return response.json();
   const problem = await response.json().catch(() => ({}));
+  if (response.status === NEEDS_KEY) {
+    await askForKey(problem.detail, given);
+    return getJson(url, options);
+  }
   throw new RequestError(problem.detail || problem.title || `The server answered ${response.status}.`, {
     code: problem.code,
     status: response.status,

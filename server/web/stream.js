@@ -1,7 +1,8 @@
 // A live stream that reconnects by itself. It keeps the wanted state (poses, emitters) and sends it to the server at first and after
 // every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
-import { FLAG_LATE, isBlock, message, parseBlock, serializePose } from "./wire.js";
+import { authorized } from "./access.js";
+import { FLAG_LATE, PROTOCOL, isBlock, message, parseBlock, serializePose } from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent
 const ACKNOWLEDGE_EVERY = 4; // blocks
@@ -9,12 +10,23 @@ const RETRY_MS = [250, 500, 1000, 2000, 4000];
 const REST_MS = 1000; // the pose of a listener at rest is sent again this often, so that the measured latency stays current
 const SILENCE_MS = 4000; // a server that sends audio is never silent for this long
 const REFUSED = 1008; // the hello was refused, so a new connection would not help
+const ACCESS_ENDED = 4401; // the key or token has expired or was revoked
+const NEEDS_KEY = 401;
 const BUSY = 503;
 
 export const now = () => performance.timeOrigin + performance.now();
 
+/** Subprotocols that carry a key, since a WebSocket of a browser has no headers of its own. */
+function protocolsFor(key) {
+  if (key === null) return [];
+  const bytes = String.fromCharCode(...new TextEncoder().encode(key));
+  const encoded = btoa(bytes).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+  return [`nafir.v${PROTOCOL}`, `nafir.key.${encoded}`];
+}
+
 export class Stream {
   #url;
+  #key;
   #hello;
   #listeners;
   #socket = null;
@@ -39,8 +51,9 @@ export class Stream {
    * `hello` is {scene, sampleRate, level, effects, output, order, head}; `listeners` are callbacks: block(block), state({state, ...}),
    * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}).
    */
-  constructor({ url, hello, listener, emitters, listeners }) {
+  constructor({ url, key = null, hello, listener, emitters, listeners }) {
     this.#url = url;
+    this.#key = key;
     this.#hello = hello;
     this.#listeners = listeners;
     this.#listener = listener;
@@ -130,7 +143,7 @@ export class Stream {
 
   #connect() {
     this.#listeners.state({ state: "connecting", attempt: this.#attempt });
-    const socket = new WebSocket(this.#url);
+    const socket = new WebSocket(this.#url, protocolsFor(this.#key));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       const { position, yaw, at } = this.#listener;
@@ -150,18 +163,26 @@ export class Stream {
     }, 1000);
   }
 
-  // A browser does not tell why a WebSocket was refused. Asked by HTTP, a server without room says when to come back.
+  // A browser does not tell why a WebSocket was refused. Asked by HTTP, the server says so, and when to come back if it has no room.
   async #unopened(socket, code, reason) {
-    const answer = await fetch(this.#url.replace(/^ws/, "http"), { cache: "no-store" }).catch(() => null);
+    const options = authorized({ cache: "no-store" }, this.#key);
+    const answer = await fetch(this.#url.replace(/^ws/, "http"), options).catch(() => null);
+    const problem = answer?.status === NEEDS_KEY ? await answer.json().catch(() => ({})) : null;
     if (this.#socket !== socket) return; // closed or renewed meanwhile
+    if (problem) {
+      this.#detach();
+      this.#listeners.state({ state: "refused", reason: problem.detail, needsKey: true });
+      return;
+    }
     if (answer?.status === BUSY) this.#comeBackMs = 1000 * Number(answer.headers.get("Retry-After")) || null;
     this.#lost(code, reason);
   }
 
   #lost(code, reason) {
     this.#detach();
-    if (code === REFUSED) {
-      this.#listeners.state({ state: "refused", reason: this.#lastError ?? (reason || "The server refused the stream.") });
+    if (code === REFUSED || code === ACCESS_ENDED) {
+      const told = this.#lastError ?? (reason || "The server refused the stream.");
+      this.#listeners.state({ state: "refused", reason: told, needsKey: code === ACCESS_ENDED });
       return;
     }
     const wait = this.#comeBackMs ?? RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];

@@ -5,12 +5,13 @@ import { Stream } from "./stream.js";
 let stream = null;
 let playerPort = null;
 
-function open({ url, hello, listener, emitters, port }) {
+function open({ url, key, hello, listener, emitters, port }) {
   stream?.close();
   playerPort = port;
   const tell = (type) => (detail) => self.postMessage({ type, detail });
   stream = new Stream({
     url,
+    key,
     hello,
     listener,
     emitters,
