@@ -420,6 +420,8 @@ class Connection:
         host, rate = self._host, levels.default.sample_rate
         filters, field_filters = host.head(hrtf, levels)
         clips = host.clips[hello.scene].at_rate(rate)
+        # What effects cost is measured at the scene's own rate, and no plan says what is true of another.
+        costs = host.effect_costs.get(hello.scene, {}) if rate == levels.own_rate else {}
         return Session(
             hello,
             levels,
@@ -435,7 +437,7 @@ class Connection:
                 block_size=hello.block_size,
                 sample_rate=rate,
             ),
-            costs=lambda bus: host.effect_costs.get(hello.scene, {}).get(bus, {}),
+            costs=lambda bus: costs.get(bus, {}),
             field_filters=field_filters,
         )
 

@@ -127,7 +127,8 @@ class Settings(BaseSettings):
     max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
     """Emitters that one stream may have at once."""
     window_blocks: Annotated[int, Field(ge=1)] = 32
-    """Blocks that may be unacknowledged, in addition to the `buffer_blocks` that a client asks for."""
+    """Blocks that may be unacknowledged, in addition to the `buffer_blocks` that a client asks for. At another sample
+    rate than the scene's there are more or fewer, which last as long."""
     max_message_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
     """A longer WebSocket message is refused; one longer than `max_frame_bytes` closes the connection."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024

@@ -297,6 +297,10 @@ def render(
     block_size: Annotated[
         int, typer.Option(help=f"Samples per block, {BLOCK_SIZES}; poses take effect at its multiples.")
     ] = 256,
+    sample_rate: Annotated[
+        int | None,
+        typer.Option(help="Render at this rate, as a stream may: 44100, 48000 or 96000. [default: the scene's]"),
+    ] = None,
     level: Level = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     hrtf: Hrtf = None,
@@ -342,7 +346,7 @@ def render(
             f"--hrtf and --effects {effects} contradict each other: add hrtf to the effects, or leave one out"
         )
     bundle = Bundle.load(find_bundle(scene))
-    levels = FieldsByLevel.load(bundle)
+    levels = FieldsByLevel.load(bundle).at_rate(sample_rate)
     if ambisonics:
         levels = levels.with_directions(level)
     field = levels.default if level is None else levels[require_level(bundle, level)]
@@ -362,16 +366,17 @@ def render(
     for number, point in enumerate(points, start=1):
         field.bundle.require_inside(point.pose.position, f"path point {number}")
     length = None if duration_s is None else round(duration_s * field.sample_rate)
-    heads = HrtfLibrary([] if hrtf is None else [hrtf], [field.sample_rate])
-    filters = heads.filters(DEFAULT_HRTF if hrtf is None else hrtf.stem, field.sample_rate)
+    heads = HrtfLibrary([] if hrtf is None else [hrtf], {field.sample_rate, levels.own_rate})
+    head = DEFAULT_HRTF if hrtf is None else hrtf.stem
+    filters, field_filters = (heads.filters(head, rate) for rate in (field.sample_rate, levels.own_rate))
     heard: Output = "ambisonics" if ambisonics else "mono" if mono else "headphones"
-    planned = planned_effects(effects, field, points[0].pose, output=heard)
+    planned = planned_effects(effects, field, points[0].pose, output=heard, block_size=block_size)
     started_s = time.perf_counter()
     with Progress(transient=True, disable=as_json, console=Console(stderr=True)) as progress:
         task = progress.add_task("rendering", total=1.0)
         samples = render_path(
             field,
-            DirectSound.of(field.bundle, filters, order=order),
+            DirectSound.of(field.bundle, filters, order=order, field_filters=field_filters),
             emitters,
             points,
             block_size=block_size,

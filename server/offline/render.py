@@ -56,7 +56,7 @@ class PathError(NafirError):
 
 @dataclass(frozen=True)
 class RenderedEmitter:
-    """An emitter that plays a clip (n,) at the scene's rate. `gain` is a linear amplitude.
+    """An emitter that plays a clip (n,) at the rate of the render. `gain` is a linear amplitude.
 
     Raises ValueError for a gain that is not finite or beyond `LOUDEST_GAIN`.
     """
@@ -254,9 +254,11 @@ def _fields(
     return fields
 
 
-def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output: Output) -> PlannedEffects | None:
-    """The effects to render by the option `choice`: `all` (returns None), those that a `plan` calls for, or exactly
-    those named, separated by commas.
+def planned_effects(
+    choice: str, field: AcousticField, listener: Pose, *, output: Output, block_size: int = 256
+) -> PlannedEffects | None:
+    """The effects to render in blocks of `block_size` by the option `choice`: `all` (returns None), those that a `plan`
+    calls for, or exactly those named, separated by commas.
 
     Raises RequestError unknown_effect.
     """
@@ -268,7 +270,8 @@ def planned_effects(choice: str, field: AcousticField, listener: Pose, *, output
     elif choice != "plan":
         named = {require_effect(name.strip()) for name in choice.split(",") if name.strip()}
         own = {name: name in named for name in EffectName}
-    return PlannedEffects(place_of_field(field), listener, output=output, scene=field.bundle.manifest.effects, own=own)
+    place = place_of_field(field, block_size)
+    return PlannedEffects(place, listener, output=output, scene=field.bundle.manifest.effects, own=own)
 
 
 class _Walk:

@@ -17,6 +17,7 @@ from server.acoustics.geometry import Pose, Vector3
 from server.acoustics.resampling import resampled_length
 from server.acoustics.room_parameters import UnmeasurableError, interaural_cross_correlation
 from server.field.field import AcousticField
+from server.field.resampled_field import at_rate
 from server.planning.scene_acoustics import Reverberation, SceneAcoustics
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import kemar
@@ -34,9 +35,11 @@ _SHORTEST_T60_S = 0.01
 
 @lru_cache(maxsize=16)
 def place_of_field(field: AcousticField, block_size: int = 256) -> SceneAcoustics:
-    """Return the acoustics of a field's scene; the first call computes responses for tens of milliseconds."""
-    known = reverberations(field) if field.bundle.manifest.fields else ()
-    return place_of(field.bundle, known, block_size=block_size)
+    """Return the acoustics of a field's scene, for blocks at the field's sample rate; the first call computes responses
+    for tens of milliseconds."""
+    own = at_rate(field, field.bundle.manifest.codec.sample_rate)
+    known = reverberations(own) if field.bundle.manifest.fields else ()
+    return place_of(field.bundle, known, block_size=block_size, sample_rate=field.sample_rate)
 
 
 def place_of(

@@ -23,7 +23,7 @@ from server.core.errors import FieldError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.rendering.head_decoder import HeadDecoder
-from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf, kemar
 from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
 from server.responses.response_batch import BATCH_FORMATS, BATCH_MEDIA_TYPES
 from tests.directional_flat import write_directional
@@ -331,6 +331,15 @@ def test_the_decoder_of_a_head_is_that_of_the_server_in_every_format(shared_clie
     samples, rate = soundfile.read(io.BytesIO(as_wav.content), dtype="float32")
     assert rate == 24_000
     np.testing.assert_array_equal(samples.T.reshape(decoder.filters.shape), decoder.filters)
+
+
+@pytest.mark.parametrize("rate", [44_100, 48_000, 96_000])
+def test_decoders_have_every_rate_of_streams(shared_client, rate):
+    told = shared_client.get(DECODER, params={"sample_rate": rate}).json()
+    decoder = HeadDecoder.of(kemar(rate), 1)
+    assert (told["sample_rate"], told["delay_samples"]) == (rate, decoder.delay)
+    np.testing.assert_array_equal(np.float32(told["filters"]), decoder.filters)
+    assert rate in shared_client.get("/v1/scenes/flat").json()["sample_rates"]
 
 
 def test_the_decoder_is_of_first_order_and_json_unless_asked_otherwise(shared_client):

@@ -23,7 +23,7 @@ from server.cli.main import main
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
-from server.rendering.hrtf import KEMAR
+from server.rendering.hrtf import KEMAR, kemar
 from server.responses.direct_sound import DirectSound
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
@@ -250,6 +250,25 @@ def test_render_of_a_level_is_that_levels(nafir, levels, filters, tmp_path):
     heard, _ = soundfile.read(output, dtype="float32")
     np.testing.assert_array_equal(heard, rough)
     assert not np.array_equal(heard, standard)
+
+
+def test_render_at_another_rate_is_what_a_stream_at_that_rate_sounds_like(nafir, levels, filters, tmp_path):
+    path, output = tmp_path / "path.csv", tmp_path / "out.wav"
+    path.write_text("time_s,x,y,z,yaw_deg\n0,2,2,1.5,0\n0.05,3,2,1.5,45\n")
+    arguments = ("--emitter", "trumpet@6,3,1.5", "--path", path, "--effects", "all", "--duration-s", 0.2, "-o", output)
+    assert nafir("render", levels.bundle.folder, *arguments, "--sample-rate", 48_000)[0] == 0
+    heard, rate = soundfile.read(output, dtype="float32")
+    assert rate == 48_000
+    emitter = RenderedEmitter(ClipLibrary(48_000).load("trumpet"), Pose((6.0, 3.0, 1.5)))
+    points = [
+        PathPoint.at(0, Pose((2.0, 2.0, 1.5))),
+        PathPoint.at(2_400, Pose.from_yaw((3.0, 2.0, 1.5), np.radians(45))),
+    ]
+    direct_sound = DirectSound.of(levels.bundle, kemar(48_000), field_filters=filters)
+    field = levels.at_rate(48_000)["standard"]
+    np.testing.assert_array_equal(heard, render(field, direct_sound, [emitter], points, length=9_600).T)
+    refused = nafir("render", levels.bundle.folder, *arguments, "--sample-rate", 32_000)
+    check_error(refused, "sample_rate", "24000, 44100, 48000, 96000")
 
 
 def test_render_names_the_row_of_a_level_that_there_is_not(nafir, levels, tmp_path):

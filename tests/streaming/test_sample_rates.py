@@ -8,8 +8,10 @@ import soxr
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
-from server.offline.render import PathPoint, RenderedEmitter, render
-from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose
+from server.offline.render import PathPoint, RenderedEmitter, planned_effects, render
+from server.planning.places import place_of, place_of_field
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, ListenerStart
 from server.rendering.hrtf import kemar
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import compute_irs
@@ -22,6 +24,7 @@ OWN = 24_000
 BLOCKS = {24_000: 256, 44_100: 512, 48_000: 512, 96_000: 1_024}
 RATES = pytest.mark.parametrize("rate", [44_100, 48_000, 96_000])
 SECONDS = 0.4
+THERE = (6.0, 3.0, 1.5)
 
 
 def clip_at(rate, *, low_hz=200, high_hz=10_000):
@@ -40,26 +43,36 @@ def places(field):
     return (start.listener, (x, y + 0.5, z)), start.emitter
 
 
-def heard(field, rate, clip=None, **hello):
+def heard(field, rate, clip=None, *, is_planned=False, **hello):
     """(channel, n): at rest for half of the time, and in the other half half a metre away."""
-    levels = FieldsByLevel([field])
+    levels, place = FieldsByLevel([field]), None
+    if is_planned:
+        known = place_of_field(field).reverberations
+        place = place_of(field.bundle, known, block_size=BLOCKS[rate], sample_rate=rate)
+    stops, emitter = places(field)
+    first = ListenerStart(position=stops[0], yaw=0.5)
+    asked = {"scene": field.bundle.id, "sample_rate": rate, "block_size": BLOCKS[rate], "listener": first, **hello}
     session = Session(
-        Hello(protocol=PROTOCOL, scene=field.bundle.id, sample_rate=rate, block_size=BLOCKS[rate], **hello),
+        Hello(protocol=PROTOCOL, **asked),
         levels,
         kemar(rate),
         lambda _: clip_at(rate) if clip is None else clip,
         quality=QualityStep.full(field.level, 1.0),
         window=10_000,
+        place=place,
         field_filters=kemar(OWN),
     )
-    stops, emitter = places(field)
     session.receive(AddEmitter(id="talker", clip="noise", position=emitter, loop=False))
     blocks = []
     for number, place in enumerate(stops, start=1):
-        session.receive(ListenerPose(pose_id=number, position=place, yaw=0.5 * number))
-        while (request := session.take_request()) is not None:
-            session.accept(compute_irs(levels.at_rate(rate), request, session.renderer))
-        blocks += [session.render_block().samples for _ in range(round(SECONDS / 2 * rate / BLOCKS[rate]))]
+        if number > 1:
+            session.receive(ListenerPose(pose_id=number, position=place, yaw=0.5 * number))
+        for _ in range(round(SECONDS / 2 * rate / BLOCKS[rate])):
+            if (plan := session.take_plan_request()) is not None:
+                session.adopt(plan.plan())
+            if (request := session.take_request()) is not None:
+                session.accept(compute_irs(levels.at_rate(rate), request, session.renderer))
+            blocks.append(session.render_block().samples)
     return np.concatenate(blocks, axis=1).astype(float)
 
 
@@ -159,23 +172,46 @@ def test_the_beginning_of_a_response_is_that_of_the_whole(directional, rate):
     np.testing.assert_allclose(first, whole[..., :1_500], atol=1e-6 * np.abs(whole).max())
 
 
-def test_an_offline_render_has_the_samples_of_a_stream(directional):
-    rate, field = 48_000, directional["bands"]
+@pytest.mark.parametrize("rate", [24_000, 44_100, 48_000])
+@pytest.mark.parametrize("choice", ["all", "plan"])
+def test_an_offline_render_has_the_samples_of_a_stream(directional, rate, choice):
+    field = directional["bands"]
+    resampled = FieldsByLevel([field]).at_rate(rate).default
     (first, second), emitter = places(field)
+    planned = planned_effects(
+        choice, resampled, Pose.from_yaw(first, 0.5), output="headphones", block_size=BLOCKS[rate]
+    )
     blocks = round(SECONDS / 2 * rate / BLOCKS[rate])
     path = [
         PathPoint.at(number * blocks * BLOCKS[rate], Pose.from_yaw(place, 0.5 * (number + 1)))
         for number, place in enumerate((first, second))
     ]
     rendered = render(
-        FieldsByLevel([field]).at_rate(rate).default,
+        resampled,
         DirectSound.of(field.bundle, kemar(rate), field_filters=kemar(OWN)),
         [RenderedEmitter(clip_at(rate), Pose(emitter))],
         path,
         block_size=BLOCKS[rate],
         length=2 * blocks * BLOCKS[rate],
+        planned=planned,
     )
-    np.testing.assert_array_equal(rendered, heard(field, rate).astype(np.float32))
+    np.testing.assert_array_equal(rendered, heard(field, rate, is_planned=choice == "plan").astype(np.float32))
+
+
+def test_live_samples_wait_for_half_a_second_of_the_streams_rate(levels):
+    session = Session(
+        Hello(protocol=PROTOCOL, scene="flat", sample_rate=96_000),
+        levels,
+        kemar(96_000),
+        lambda _: clip_at(96_000),
+        quality=QualityStep.full(levels.default.level, 1.0),
+        field_filters=kemar(OWN),
+    )
+    session.receive(AddEmitter(id="guest", live=True, position=THERE))
+    for sequence in range(60):
+        assert not session.receive(DryBlock("guest", sequence, np.zeros(1_000, np.float32)))
+    (live,) = session.live_statuses()
+    assert (live.samples_queued, live.samples_dropped) == (48_000, 12_000)
 
 
 def test_a_head_of_another_rate_is_no_head_of_a_stream(levels, filters):
