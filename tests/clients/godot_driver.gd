@@ -1,0 +1,201 @@
+# Tests client_examples/godot/nafir/nafir_core.gd in GDScript itself, and prints its text messages for test_godot.py. Run by
+#
+#   godot3-server -s godot_driver.gd --core=PATH --vectors=PATH
+#
+# It prints "checked N" after N comparisons, and ends with 1 after the first that fails.
+extends SceneTree
+
+var _checked = 0
+
+
+# What a player of Godot does with frames, at a rate of its own.
+class Generator:
+	var room
+	var queue = []
+
+	func _init(frames):
+		room = frames
+
+	func get_frames_available():
+		return room - queue.size()
+
+	func push_frame(frame):
+		queue.append(frame)
+
+	func take(count):
+		var taken = []
+		for _index in range(min(count, queue.size())):
+			taken.append(queue.pop_front())
+		return taken
+
+
+func _initialize():
+	var given = {}
+	for word in OS.get_cmdline_args():
+		var parts = word.trim_prefix("--").split("=")
+		if parts.size() == 2:
+			given[parts[0]] = parts[1]
+	var core = load(given.core)
+	var file = File.new()
+	file.open(given.vectors, File.READ)
+	var vectors = JSON.parse(file.get_as_text()).result
+	var is_right = (
+		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _playing(core, 24036) and _playing(core, 23964)
+	)
+	print("checked %d" % _checked)
+	quit(0 if is_right else 1)
+
+
+func _poses(core, table):
+	for each in table:
+		var there = each.godot
+		var here = each.nafir
+		var place = Vector3(there.position[0], there.position[1], there.position[2])
+		var turn = Quat(there.rotation[0], there.rotation[1], there.rotation[2], there.rotation[3])
+		var pose = core.make_pose(place, turn)
+		if not (_near(pose.position, here.position) and _same_turn(pose.orientation, here.orientation)):
+			return _fail("pose", each)
+		var back = core.position_from_nafir(here.position)
+		if not (_near([back.x, back.y, back.z], there.position) and _same_turn(core.orientation_from_nafir(here.orientation), there.rotation)):
+			return _fail("pose and back", each)
+		# The engine's own idea of ahead, right and up: from its Basis.
+		var basis = Basis(turn)
+		if not (
+			_near(core.position_to_nafir(-basis.z), here.ahead) and _near(core.position_to_nafir(-basis.x), here.left)
+			and _near(core.position_to_nafir(basis.y), here.up)
+		):
+			return _fail("directions", each)
+	return true
+
+
+func _listener(core, wanted):
+	var data = core.serialize_listener(int(wanted.pose_id), wanted)
+	return _equal("listener", data.data_array.hex_encode(), wanted.hex)
+
+
+func _dry(core, table):
+	for each in table:
+		if each.encoding != "s16":
+			continue
+		var data = core.serialize_dry_block(each.id, int(each.sequence), each.samples)
+		if not _equal("dry block", data.data_array.hex_encode(), each.hex):
+			return false
+	return true
+
+
+func _blocks(core, table):
+	for each in table:
+		if each.encoding != "s16":
+			continue
+		var block = core.parse_block(_buffer(each.hex))
+		for name in ["sequence", "pose_id", "reverberation_pose_id", "flags"]:
+			if not _equal(name, block[name], int(each[name])):
+				return false
+		if not _equal("sample_clock", str(block.sample_clock), "1099511627781"): # JSON here has floats
+			return false
+		for channel in range(each.channels.size()):
+			for index in range(block.frames.size()):
+				var frame = block.frames[index]
+				if not _near([frame[channel]], [each.channels[channel][index]]):
+					return _fail("samples", each)
+		for size in range(each.hex.length() / 2):
+			if not _equal("a damaged block", core.parse_block(_buffer(each.hex.substr(0, 2 * size))), null):
+				return false
+	return true
+
+
+func _texts(core):
+	var stream = core.new()
+	stream.scene = "flat \"1\""
+	stream.begin()
+	var pose = core.make_pose(Vector3(1.5, 0.25, 2.25), Quat(0, 0, 0, 1))
+	stream.set_listener(pose)
+	print(to_json(stream.hello()))
+	stream.set_emitter("npc-ä", "trumpet", pose, -3.5)
+	stream.receive({"type": "of a newer server"})
+	stream.receive(null)
+	stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard"})
+	stream.set_emitter("mine", null, pose, 0.0)
+	stream.set_emitter("mine", null, pose, -6.0)
+	stream.set_emitter("mine", null, core.make_pose(Vector3(1, 2, 3), Quat(0, 0, 0, 1)), -6.0)
+	stream.step(0.1)
+	stream.remove_emitter("mine")
+	for each in stream.texts:
+		print(to_json(each))
+	return _equal("a pose was sent", stream.packets.size(), 1)
+
+
+# A server's clock of `rate` samples a second against a player's of 24000, for eight seconds: no gaps, and the pace follows.
+func _playing(core, rate):
+	var stream = core.new()
+	stream.begin()
+	stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard"})
+	var generator = Generator.new(1920)
+	var sent = 0
+	var sequence = 0
+	var pace = 1.0
+	var owed = 0.0
+	for tick in range(480):
+		while sent < tick * rate / 60.0 + 2048:
+			var data = StreamPeerBuffer.new()
+			for each in [1, 0, 2, 0]:
+				data.put_u8(each)
+			data.put_u32(sequence)
+			data.put_u64(sent)
+			for each in [0, 0, 256]:
+				data.put_u32(each)
+			for index in range(256):
+				data.put_16((sent + index) % 30000)
+				data.put_16(0)
+			if not _equal("a block", stream.receive_block(data), true):
+				return false
+			sent += 256
+			sequence += 1
+		pace = stream.play(generator, 1.0 / 60)
+		owed += pace * 400
+		owed -= generator.take(int(owed)).size()
+		if not _equal("underruns at %d" % rate, stream.underruns, 0):
+			return false
+		if abs(pace - 1.0) > 0.00201:
+			return _fail("pace", pace)
+	# The ramp that was sent is what would be played: nothing is lost on the way but what the beginning skipped.
+	var rest = generator.take(1920)
+	for index in range(1, rest.size()):
+		var step = int(round((rest[index].x - rest[index - 1].x) * 32767.0))
+		if not _equal("a step", step == 1 or step == -29999, true):
+			return false
+	return _equal("the pace %f at %d" % [pace, rate], (pace > 1.0001) if rate > 24000 else (pace < 0.9999), true)
+
+
+func _buffer(hex):
+	var data = StreamPeerBuffer.new()
+	for index in range(0, hex.length(), 2):
+		data.put_u8(("0x" + hex.substr(index, 2)).hex_to_int())
+	return data
+
+
+func _near(found, wanted):
+	_checked += 1
+	for index in range(wanted.size()):
+		if abs(found[index] - wanted[index]) > 2e-6 * max(1.0, abs(wanted[index])):
+			return false
+	return found.size() == wanted.size()
+
+
+# A quaternion and its negative are the same turn.
+func _same_turn(found, wanted):
+	var negative = []
+	for each in found:
+		negative.append(-each)
+	return _near(found, wanted) or _near(negative, wanted)
+
+
+func _equal(what, found, wanted):
+	_checked += 1
+	return true if typeof(found) == typeof(wanted) and found == wanted else _fail("%s: %s, not" % [what, found], wanted)
+
+
+func _fail(what, at):
+	printerr("%s %s" % [what, at])
+	return false
