@@ -33,6 +33,9 @@ MEASURE ?= --half report
 FUZZ_SECONDS ?= 60
 # Folders with tests that watch the clock: collecting the others takes as long as many a test.
 TIMED := $(addprefix tests/,api bench integration runtime streaming)
+# Pages of /docs and /redoc, kept in server/web/vendor.
+SWAGGER_UI := 5.35.0
+REDOC := 2.5.4
 VENV := .venv
 # The Python package for clients, with a project file of its own.
 CLIENT := client_examples/python
@@ -52,7 +55,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: cluster-test long mutants attacks docs docs-serve results lock
+.PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
 help: ## show this list
@@ -138,6 +141,12 @@ lock: $(VENV)/installed-dev ## take newer versions into requirements.lock, the b
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --upgrade --generate-hashes --strip-extras \
 		--no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options \
 		--output-file requirements.lock pyproject.toml
+
+vendor: ## fetch Swagger UI and Redoc, of the versions in this file, into server/web/vendor (needs npm)
+	rm -rf build/vendor && mkdir -p build/vendor
+	cd build/vendor && npm pack --silent swagger-ui-dist@$(SWAGGER_UI) redoc@$(REDOC)
+	cd build/vendor && for each in *.tgz; do tar -xzf $$each --one-top-level; done
+	.ci/pack-vendor.sh build/vendor/swagger-ui-dist-$(SWAGGER_UI)/package build/vendor/redoc-$(REDOC)/package
 
 results: $(VENV)/installed-dev ## write the tables and plots of docs/results anew from benchmarks/*/*.json
 	$(BIN)/python -m benchmarks.pages

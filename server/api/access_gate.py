@@ -65,9 +65,9 @@ def scopes_for(method: str, path: str) -> frozenset[api_keys.Scope]:
 
 
 def page_paths(folder: Path) -> frozenset[str]:
-    """Paths of the files of a page, and `/`."""
+    """Paths of the files of a page, compressed ones by their own names, and `/`."""
     files = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-    return frozenset({"/", *(f"/{name}" for name in files)})
+    return frozenset({"/", *(f"/{name.removesuffix('.gz')}" for name in files)})
 
 
 def caller_of(scope: Scope) -> Caller | None:

@@ -17,6 +17,7 @@ from starlette.types import Scope
 from server.api.access import Access
 from server.api.access_gate import AccessGate, page_paths
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
+from server.api.compression import Compression
 from server.api.connection import StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
@@ -148,7 +149,7 @@ def create_app(
         version=version("nafir"),
         description="Renders how a place sounds, in real time. Live streams are described at /asyncapi.json.",
         lifespan=lifespan,
-        docs_url="/docs",
+        docs_url=None,  # the page has both, without scripts from elsewhere
         redoc_url=None,
     )
     app.add_middleware(DrainGate, drain=drain)
@@ -157,6 +158,7 @@ def create_app(
     app.include_router(documents)
     app.include_router(api)
     install_openapi(app, is_protected=access is not None)
+    app.add_middleware(Compression)
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     if access is not None:
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())

@@ -1,6 +1,9 @@
-"""The page's static files, with entity tags by content and correct `Allow` headers."""
+"""The page's static files, with entity tags by content and correct `Allow` headers. NAME is also found as NAME.html,
+and as NAME.gz, which is stored compressed."""
 
+import gzip
 import hashlib
+import mimetypes
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -13,12 +16,22 @@ from starlette.responses import Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
+from server.api.compression import accepts_gzip
+
 _ALLOW = {"Allow": "GET, HEAD, OPTIONS"}
+_COMPRESSED = ".gz"
 
 
 class PageFiles(StaticFiles):
     """Static files with entity tags by content. Starlette's tags depend on size and modification time, which two builds
-    of one image may share although the bytes differ. Starlette also sends no `Allow`."""
+    of one image may share although the bytes differ. Starlette also sends no `Allow`, and knows no compressed files."""
+
+    def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
+        for suffix in ("", ".html", _COMPRESSED):
+            found = super().lookup_path(path + suffix)
+            if found[1] is not None:
+                break
+        return found
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         if scope["method"] in {"GET", "HEAD"}:
@@ -33,8 +46,19 @@ class PageFiles(StaticFiles):
     def file_response(
         self, full_path: Any, stat_result: os.stat_result, scope: Scope, status_code: int = 200
     ) -> Response:
-        response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
-        response.headers["ETag"] = _tag(Path(full_path), stat_result.st_mtime_ns, stat_result.st_size)
+        tag = _tag(Path(full_path), stat_result.st_mtime_ns, stat_result.st_size)
+        if not full_path.endswith(_COMPRESSED):
+            response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
+        elif accepts_gzip(Headers(scope=scope)):
+            response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
+            response.headers["Content-Encoding"] = "gzip"
+            response.headers["Vary"] = "Accept-Encoding"
+        else:
+            media_type = mimetypes.guess_type(full_path)[0]
+            response = Response(gzip.decompress(Path(full_path).read_bytes()), status_code, media_type=media_type)
+            response.headers["Vary"] = "Accept-Encoding"
+            tag = f'{tag[:-1]}-whole"'
+        response.headers["ETag"] = tag
         had = Headers(scope=scope).get("if-none-match", "")
         if response.headers["ETag"] in {tag.strip().removeprefix("W/") for tag in had.split(",")}:
             return NotModifiedResponse(response.headers)

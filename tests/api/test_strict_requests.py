@@ -8,12 +8,12 @@ from tests.api.test_routes import PLACES, check_problem, wait_until_ready
 
 SCENE = "/v1/scenes/flat"
 EMITTER = {"emitter": "6,3,1.5"}
+FILES = ("/", "/stream.js", "/docs", "/redoc", "/vendor/swagger-ui.css")
 GETS = [
     ("/livez", {}),
     ("/readyz", {}),
     ("/asyncapi.json", {}),
     ("/openapi.json", {}),
-    ("/docs", {}),
     ("/v1/scenes", {}),
     (SCENE, {}),
     (f"{SCENE}/frontier", {}),
@@ -23,8 +23,7 @@ GETS = [
     ("/v1/clips", {}),
     ("/v1/hrtfs", {}),
     ("/v1/hrtfs/kemar/decoder", {"sample_rate": "24000"}),
-    ("/", {}),
-    ("/stream.js", {}),
+    *[(path, {}) for path in FILES],
 ]
 CHANGING = {"date", "x-response-time"}
 
@@ -41,13 +40,16 @@ def client(bundle, hrtfs):
 def test_head_is_get_without_a_body(client, path, params):
     for _ in range(3):  # a plan changes once more when the server has measured what effects cost
         got, head = client.get(path, params=params), client.head(path, params=params)
-        told = [{name: text for name, text in each.headers.items() if name not in CHANGING} for each in (got, head)]
+        # How long a compressed file is, is known only once it is.
+        ignored = CHANGING | ({"content-length"} if path in FILES and "content-encoding" in got.headers else set())
+        told = [{name: text for name, text in each.headers.items() if name not in ignored} for each in (got, head)]
         if told[0] == told[1]:
             break
     assert told[0] == told[1]
     assert head.status_code == got.status_code
     assert head.content == b""
-    assert int(head.headers["content-length"]) == len(got.content) > 0
+    if "content-encoding" not in head.headers:
+        assert int(head.headers["content-length"]) == len(got.content) > 0
 
 
 def test_head_of_metrics_has_its_type(client):
@@ -85,7 +87,7 @@ def test_a_stream_asked_for_over_http_says_what_it_is(client):
     assert answer.headers["upgrade"] == "websocket"
 
 
-@pytest.mark.parametrize(("path", "params"), [each for each in GETS if each[0] not in {"/", "/stream.js"}])
+@pytest.mark.parametrize(("path", "params"), [each for each in GETS if each[0] not in FILES])
 @pytest.mark.parametrize("name", ["colour", "Listener", "emitter[]", " "])
 def test_a_parameter_that_there_is_not_is_refused_on_every_route(client, path, params, name):
     check_problem(client.get(path, params={**params, name: "1"}), 422, "unknown_parameter", name)
