@@ -67,7 +67,7 @@ from server.protocol.codes import (
     SERVICE_RESTART,
     TRY_AGAIN_LATER,
 )
-from server.protocol.server_messages import Error, Pong, ServerMessage, Welcome
+from server.protocol.server_messages import EmitterEnded, Error, Pong, ServerMessage, Welcome
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
@@ -556,8 +556,11 @@ class Connection:
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
         """Send the audio thread's output: blocks at once if there is a fast path and nothing waits to be sent."""
-        if self._stream is None:
+        if self._stream is None or self._place is None:
             return  # rendered before the audio thread knew that the connection ends
+        for each in outgoing:
+            if isinstance(each, EmitterEnded) and each.removed:
+                self._host.admission.remove_emitter(self._place)
         blocks: list[bytes] = []
         if self._fast_path is not None and not (self._outgoing or self._is_sending):
             now_s = self._time_s()

@@ -52,7 +52,16 @@ LevelName = Annotated[str, Field(max_length=256)]
 # guard: a gain in a message is one that can be heard
 GainDb = Annotated[FiniteFloat, Field(ge=-80, le=24)]
 
+Clock = Annotated[int, Field(ge=0, lt=2**53), WHOLE]  # JavaScript counts exactly up to here
+"""A clock of the stream: samples since its beginning."""
+ClipTime = Annotated[FiniteFloat, Field(ge=0, le=86_400)]
+"""Seconds from the beginning of a clip."""
+FadeTime = Annotated[FiniteFloat, Field(ge=0.001, le=60)]
+RampTime = Annotated[FiniteFloat, Field(ge=0, le=600)]
+
 _POSE_FIELDS = frozenset({"position", "orientation", "yaw", "listener"})
+_OF_LOOPS: Final = ("loop_start_s", "loop_end_s")
+_OF_CLIPS: Final = ("start_at", "stop_at", "offset_s", *_OF_LOOPS, "remove_when_ended")
 
 
 class _Directed(Message):
@@ -169,6 +178,15 @@ class AddEmitter(_Directed):
     """Adds an emitter, which plays a clip or, with `live`, the dry blocks that the client sends for it.
 
     Its orientation affects only its directivity. Without a directivity it is equally loud in all directions.
+
+    A clip begins at the sample clock `start_at` of the stream, to the sample; without it, or if that has passed when
+    its first impulse response is there, at once. `emitter_added` says when. It begins `offset_s` seconds into the clip,
+    where it fades in over 64 samples. With `loop` it repeats what lies between `loop_start_s` and `loop_end_s`, which
+    are the clip's ends by default, without a gap. From `stop_at` on it fades out over 10 ms; a `stop_emitter` may do
+    that too. A clip that has not begun by then is not heard.
+
+    Once a clip without `loop`, or a stopped one, has been heard to its end with its reverberation, an `emitter_ended`
+    says so. With `remove_when_ended` the emitter is removed then, and its id is free.
     """
 
     type: Literal["add_emitter"] = "add_emitter"
@@ -178,12 +196,42 @@ class AddEmitter(_Directed):
     gain_db: GainDb = 0.0
     loop: bool = True
     directivity: DirectivityPattern | None = None
+    start_at: Clock | None = None
+    stop_at: Clock | None = None
+    offset_s: ClipTime = 0.0
+    loop_start_s: ClipTime = 0.0
+    loop_end_s: ClipTime | None = None
+    remove_when_ended: bool = False
 
     @model_validator(mode="after")
     def _has_one_sound(self) -> Self:
         if self.live == (self.clip is not None):
             raise PydanticCustomError("malformed_emitter", "give a clip or live, one of them")
+        if self.live and (given := self._given(*_OF_CLIPS)):
+            raise _misplaced(given, "belongs to a clip, and the emitter is live")
+        if not self.loop and (given := self._given(*_OF_LOOPS)):
+            raise _misplaced(given, "belongs to a loop, and loop is false")
         return self
+
+    def _given(self, *names: str) -> str | None:
+        """The first of these fields that is not as it is by default."""
+        fields = type(self).model_fields
+        return next((name for name in names if getattr(self, name) != fields[name].default), None)
+
+
+def _misplaced(field: str, problem: str) -> PydanticCustomError:
+    return PydanticCustomError("misplaced_field", "{problem}", {"problem": problem, "field": field})
+
+
+class StopEmitter(Message):
+    """Lets an emitter's clip fade out over `fade_s` from the sample clock `stop_at` on; without it, or if that has
+    passed, from the next block on. An `emitter_ended` follows, as at the end of the clip. The newest `stop_emitter`
+    counts until the fade begins. A live emitter is removed instead."""
+
+    type: Literal["stop_emitter"] = "stop_emitter"
+    id: EmitterId
+    stop_at: Clock | None = None
+    fade_s: FadeTime = 0.01
 
 
 class MoveEmitter(_Directed):
@@ -195,11 +243,14 @@ class MoveEmitter(_Directed):
 
 
 class SetGain(Message):
-    """Sets the gain of an emitter, for direct sound and reflected field alike."""
+    """Sets the gain of an emitter, for direct sound and reflected field alike. It is reached by the end of the next
+    block or, with `ramp_s`, by a ramp that begins with the next block, is linear in decibels, and ends to the sample. A
+    newer gain takes the place of a ramp. An emitter that is not heard yet has its gain at once."""
 
     type: Literal["set_gain"] = "set_gain"
     id: EmitterId
     gain_db: GainDb
+    ramp_s: RampTime = 0.0
 
 
 class SetLevel(Message):
@@ -282,6 +333,7 @@ TextMessage = (
     Hello
     | AddEmitter
     | MoveEmitter
+    | StopEmitter
     | SetGain
     | SetLevel
     | SetEffects
@@ -299,7 +351,8 @@ _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(dis
 
 def emitter_of(message: ClientMessage) -> str | None:
     """The id of the emitter that a message is about; None if it is about none."""
-    return message.id if isinstance(message, AddEmitter | MoveEmitter | SetGain | RemoveEmitter | DryBlock) else None
+    about_one = AddEmitter | MoveEmitter | StopEmitter | SetGain | RemoveEmitter | DryBlock
+    return message.id if isinstance(message, about_one) else None
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
@@ -364,6 +417,8 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
     else:
         code = "malformed_message"
     reason = str(first["msg"])
+    if kind == "misplaced_field":
+        field = str(first["ctx"]["field"])
     if kind == "extra_forbidden":
         known = _FIELDS.get(str(first["loc"][0]), ()) if len(place) == 1 else ()
         reason = f"unknown field{suggestion(place[-1], known) if known else ''}"

@@ -41,6 +41,8 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "fixed_directivity": "the scene's responses hold the direct sound, so its emitters cannot have a directivity",
     "no_directions": "the scene, or the quality level, does not know from where sound arrives, so it has no ambisonics",
     "fixed_output": "a stream of ambisonics stays one, and no other stream becomes one; open another stream",
+    "outside_clip": "the offset or the loop reaches beyond the clip, or the loop has no length",
+    "is_live": "a live emitter cannot be stopped, only removed",
     "not_live": "a dry block came for an emitter that plays a clip",
     "bad_samples": "live samples were not audio and were replaced by silence",
     "field_failure": "no impulse response could be computed; the last ones stay in effect",

@@ -20,11 +20,13 @@ from server.protocol.client_messages import (
     SetEffects,
     SetGain,
     SetLevel,
+    StopEmitter,
 )
 from server.protocol.server_messages import (
     Durations,
     EffectDecision,
     EmitterAdded,
+    EmitterEnded,
     EmitterRemoved,
     Error,
     LevelChanged,
@@ -169,6 +171,14 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     Step("sends what the microphone hears (here two frames)", DryBlock("me", 0, np.array([0.5, -0.5], np.float32))),
     Step("moves the microphone", MoveEmitter(id="me", position=(2.5, 2.0, 1.5), pose_id=3)),
     Step("turns it down", SetGain(id="me", gain_db=-12.0)),
+    Step("fades the talker to a whisper within two seconds", SetGain(id="talker", gain_db=-24.0, ramp_s=2.0)),
+    Step(
+        "lets a door slam at clock 43 200, once",
+        AddEmitter(
+            id="slam-1", clip="door", position=(5.0, 1.5, 1.0), loop=False, start_at=43_200, remove_when_ended=True
+        ),
+    ),
+    Step("it will", EmitterAdded(id="slam-1", sample_clock=43_200)),
     Step("switches air absorption on, whatever the plan says", SetEffects(effects={"air_absorption": True})),
     Step("chooses a cheaper quality level", SetLevel(level="fast")),
     Step(
@@ -207,6 +217,8 @@ EXCHANGE: Final[tuple[Step, ...]] = (
             field="position",
         ),
     ),
+    Step("it has slammed, and the room is quiet again", EmitterEnded(id="slam-1", sample_clock=86_016, removed=True)),
+    Step("lets the talker stop in the middle of a word", StopEmitter(id="talker", stop_at=96_000, fade_s=0.02)),
     Step("takes the microphone away", RemoveEmitter(id="me")),
     Step("it is gone", EmitterRemoved(id="me")),
 )

@@ -77,12 +77,23 @@ class Welcome(Message):
 
 
 class EmitterAdded(Message):
-    """The emitter's first impulse response is in effect. Its clip begins at `sample_clock`, in the next block. A live
-    emitter begins then too, once enough of its samples wait."""
+    """The emitter's first impulse response is in effect. Its clip begins at `sample_clock`: with the next block or at
+    the `start_at` of its `add_emitter`, if that is later. A live emitter begins then too, once enough of its samples
+    wait."""
 
     type: Literal["emitter_added"] = "emitter_added"
     id: str
     sample_clock: int
+
+
+class EmitterEnded(Message):
+    """The emitter's clip is over or was stopped, and all its sound had been heard by `sample_clock`. If it was to be
+    `removed` then, its id is free; no `emitter_removed` follows."""
+
+    type: Literal["emitter_ended"] = "emitter_ended"
+    id: str
+    sample_clock: int
+    removed: bool
 
 
 class EmitterRemoved(Message):
@@ -238,7 +249,9 @@ class Error(Message):
         )
 
 
-ServerMessage = Welcome | EmitterAdded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error
+ServerMessage = (
+    Welcome | EmitterAdded | EmitterEnded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error
+)
 _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 
 

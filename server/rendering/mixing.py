@@ -2,7 +2,8 @@
 (`server.rendering.mixing_kernel`) mixes it, or this module for block sizes that compiled code does not support.
 
 Each emitter has a slot, which is a row of `dry` (slot, block). Its samples are scaled by its gain for the direct path,
-and by gain and send for the convolver. Both reach their wanted values by the end of a block, along a raised cosine.
+and by gain and send for the convolver. Both reach their wanted values by the end of a block, along a raised cosine. A
+gain may also follow a ramp, linear in decibels: then it is multiplied by a factor that ends as 1.
 
 A mixer has a convolver only while something is sent to it, and otherwise costs nothing for it. Where there is a bus,
 the convolver's channels are decoded by it to the two ears of the direct paths.
@@ -18,9 +19,9 @@ from server.rendering.bus import Bus
 from server.rendering.convolver import Convolver, FloatArray
 from server.rendering.direct_path import DirectPath
 from server.rendering.fade import raised_cosine
-from server.rendering.mixing_kernel import enter_convolver, record_of
+from server.rendering.mixing_kernel import RAMP, enter_convolver, record_of
 from server.rendering.partitions import is_power_of_two
-from server.rendering.sources import ClipPlayer, Source
+from server.rendering.sources import PLAYBACK, ClipPlayer, Source
 
 
 def is_read_by_compiled_code(source: Source) -> TypeGuard[ClipPlayer]:
@@ -47,8 +48,9 @@ class Mixer:
         self.dry = np.zeros((slots, block_size), np.float32)
         self.gain = np.zeros((2, slots), np.float32)
         self.send = np.zeros((2, slots), np.float32)
+        self.ramp = np.zeros(slots, RAMP)
         self.plays = np.zeros(slots, np.int64)
-        self.clip, self.clip_samples, self.clip_at, self.clip_loops = (np.zeros(slots, np.int64) for _ in range(4))
+        self.playback = np.zeros(slots, PLAYBACK)
         self._sources: dict[int, Source] = {}
         self._clips: dict[int, FloatArray] = {}
         self._followed: dict[int, FloatArray] = {}
@@ -103,8 +105,7 @@ class Mixer:
         """Play a source in a slot from the next block on. Compiled code reads clips itself."""
         self.plays[slot] = 1
         if self.is_compiled and is_read_by_compiled_code(source):
-            self.clip[slot] = source.clip.ctypes.data
-            self.clip_samples[slot], self.clip_at[slot], self.clip_loops[slot] = source.clip.size, 0, source.loop
+            self.playback[slot] = source.playback
             self._clips[slot] = source.clip  # kept alive as long as it is played
         else:
             self._sources[slot] = source
@@ -114,16 +115,37 @@ class Mixer:
         to fade out."""
         self.plays[slot] = 1
         if from_slot in other._clips:
-            for mine, theirs in zip(self._clip_fields, other._clip_fields, strict=True):
-                mine[slot] = theirs[from_slot]
+            self.playback[slot] = other.playback[from_slot]
             self._clips[slot] = other._clips[from_slot]
         else:
             self._sources[slot] = other._sources[from_slot]
             self._followed[slot] = other.dry[from_slot]
 
-    @property
-    def _clip_fields(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], ...]:
-        return self.clip, self.clip_samples, self.clip_at, self.clip_loops
+    def playback_of(self, slot: int, source: ClipPlayer) -> np.void:
+        """The PLAYBACK record by which a slot plays `source`."""
+        record: np.void = self.playback[slot] if slot in self._clips else source.playback
+        return record
+
+    def set_gain(self, slot: int, gain: float) -> None:
+        """Set a gain at once."""
+        self.gain[:, slot] = gain
+        self.ramp[slot] = 0
+
+    def reach_gain(self, slot: int, gain: float) -> None:
+        """Reach a gain by the end of the next block."""
+        ramp = self.ramp[slot]
+        if ramp["left"]:
+            self.gain[0, slot] *= ramp["factor"]
+            self.ramp[slot] = 0
+        self.gain[1, slot] = gain
+
+    def ramp_gain(self, slot: int, gain: float, samples: int) -> None:
+        """Let the gain go to another one, linearly in decibels, over the next `samples`. Both are above 0."""
+        ramp, wanted = self.ramp[slot], float(self.gain[1, slot])
+        factor = (float(ramp["factor"]) if ramp["left"] else 1.0) * wanted / gain
+        self.ramp[slot] = samples, factor, factor ** (-1 / samples)
+        self.gain[0, slot] *= gain / wanted
+        self.gain[1, slot] = gain
 
     def stop(self, slot: int) -> None:
         """Silence a slot at once."""
@@ -131,7 +153,8 @@ class Mixer:
         self.dry[slot] = 0
         if self.is_compiled and self.convolver is not None:
             self.convolver.compiled.input[slot] = 0
-        self.clip[slot] = 0
+        self.playback[slot] = 0
+        self.ramp[slot] = 0
         self._clips.pop(slot, None)
         self._sources.pop(slot, None)
         self._followed.pop(slot, None)
@@ -164,6 +187,9 @@ def mix(mixer: Mixer) -> None:
     """Compute the next block, of any size, and write it to the mixer's `output`."""
     plays = mixer.plays.astype(bool)
     mixer.dry[~plays] = 0
+    for slot in np.flatnonzero(mixer.ramp["left"]):
+        if plays[slot]:
+            _follow_ramp(mixer.ramp[slot], mixer.dry[slot])
     mixer.dry *= _ramp(mixer.gain, mixer.fade_in)
     mixer.gain[0, plays] = mixer.gain[1, plays]
     convolved = None
@@ -177,6 +203,13 @@ def mix(mixer: Mixer) -> None:
         mixer.bus.process(convolved, mixer.output)
     if mixer.direct is not None:
         mixer.direct.process(mixer.dry, mixer.output)
+
+
+def _follow_ramp(ramp: np.void, row: FloatArray) -> None:
+    count = min(int(ramp["left"]), row.size)
+    row[:count] *= (ramp["factor"] * ramp["step"] ** np.arange(1, count + 1)).astype(np.float32)
+    ramp["factor"] *= ramp["step"] ** count
+    ramp["left"] -= count
 
 
 def _ramp(ends: FloatArray, fade_in: FloatArray) -> FloatArray:

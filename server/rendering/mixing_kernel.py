@@ -1,5 +1,6 @@
 """The compiled code of `server.rendering.mixing`."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,11 @@ from server.kernels.simd import broadcast, load, multiply, multiply_add, pointer
 from server.rendering.bus_kernel import BUS, decode_bus
 from server.rendering.convolver_kernel import process_convolver
 from server.rendering.direct_path_kernel import render_direct_paths
+from server.rendering.sources import PLAYBACK
+
+RAMP = np.dtype([("left", np.int64), ("factor", np.float64), ("step", np.float64)])
+"""A gain on its way: for `left` more samples the wanted gain is multiplied by `factor`, which is multiplied by `step`
+from sample to sample."""
 
 MIXER = np.dtype(
     [
@@ -22,12 +28,10 @@ MIXER = np.dtype(
             "channels",  # of the output
             "block_size",
             "plays",  # (slot,) int64
-            "clip",  # (slot,) int64: address of the float32 samples that a slot plays; 0 if Python fills its row
-            "clip_samples",  # (slot,) int64
-            "clip_at",  # (slot,) int64: next sample
-            "clip_loops",  # (slot,) int64
+            "playback",  # (slot,) PLAYBACK: the clips that slots play
             "dry",  # (slot, block_size) float32
             "gain",  # (2, slot) float32: in effect, and wanted
+            "ramp",  # (slot,) RAMP: of the gains
             "send",  # (2, slot) float32: in effect, and wanted
             "sent",  # (slot, block_size) float32, the convolver's input; 0 for none
             "fade_in",  # (block_size,) float32
@@ -67,26 +71,38 @@ def mix(mixer, like: Reference | None) -> None:
 def _play(mixer) -> None:
     """Fill the rows of slots that play a clip, as `server.rendering.sources.ClipPlayer` does."""
     slots, size = mixer.slots, mixer.block_size
-    clip = carray(pointer(mixer.clip), (slots,), np.int64)
-    samples = carray(pointer(mixer.clip_samples), (slots,), np.int64)
-    at = carray(pointer(mixer.clip_at), (slots,), np.int64)
-    loops = carray(pointer(mixer.clip_loops), (slots,), np.int64)
+    playback = carray(pointer(mixer.playback), (slots,), PLAYBACK)
     dry = carray(pointer(mixer.dry), (slots, size), np.float32)
     for slot in range(slots):
-        if clip[slot] == 0:
-            continue
-        values = carray(pointer(clip[slot]), (samples[slot],), np.float32)
-        written = 0
-        while written < size:
-            count = min(size - written, samples[slot] - at[slot])
-            if count == 0:  # a clip that does not loop is over
-                dry[slot, written:] = 0
-                break
-            copy(values[at[slot] : at[slot] + count], dry[slot, written:])
-            written += count
-            at[slot] += count
-            if loops[slot] != 0 and at[slot] == samples[slot]:
-                at[slot] = 0
+        if playback[slot].clip != 0:
+            _play_clip(playback[slot], dry[slot], size)
+
+
+@compiled
+def _play_clip(record, out, size) -> None:
+    waits = min(max(record.starts_in, 0), size)
+    out[:waits] = 0
+    end = record.loop_end if record.loop_end != 0 else record.samples
+    values = carray(pointer(record.clip), (record.samples,), np.float32)
+    written = waits
+    while written < size:
+        count = min(size - written, end - record.at)
+        if count <= 0:  # a clip that does not loop is over
+            out[written:] = 0
+            break
+        copy(values[record.at : record.at + count], out[written:])
+        written += count
+        record.at += count
+        if record.loop_end != 0 and record.at == end:
+            record.at = record.loop_start
+    played = waits - record.starts_in
+    for n in range(waits, min(size, waits + record.fade_in - played)):
+        out[n] *= np.float32(0.5 - 0.5 * math.cos(math.pi * (played + n - waits + 0.5) / record.fade_in))
+    for n in range(max(record.stops_in, 0), size):
+        faded = min((n - record.stops_in + 0.5) / record.fade_out, 1.0)
+        out[n] *= np.float32(0.5 + 0.5 * math.cos(math.pi * faded))
+    record.starts_in -= size
+    record.stops_in -= size
 
 
 @compiled
@@ -96,10 +112,14 @@ def _scale(mixer) -> None:
     slots, size = mixer.slots, mixer.block_size
     plays = carray(pointer(mixer.plays), (slots,), np.int64)
     gain = carray(pointer(mixer.gain), (2, slots), np.float32)
+    ramp = carray(pointer(mixer.ramp), (slots,), RAMP)
     send = carray(pointer(mixer.send), (2, slots), np.float32)
+    dry = carray(pointer(mixer.dry), (slots, size), np.float32)
     for slot in range(slots):
         row = slot * size
         if plays[slot] != 0:
+            if ramp[slot].left > 0:
+                _follow_ramp(ramp[slot], dry[slot], size)
             start, change = broadcast(gain[0, slot]), broadcast(gain[1, slot] - gain[0, slot])
             for n in range(0, size, 8):
                 scaled = multiply_add(change, load(mixer.fade_in, n), start)
@@ -115,12 +135,21 @@ def _scale(mixer) -> None:
         send[0, slot] = send[1, slot]
 
 
+@compiled
+def _follow_ramp(ramp, row, size) -> None:
+    count = min(ramp.left, size)
+    for n in range(count):
+        ramp.factor *= ramp.step
+        row[n] = np.float32(row[n] * ramp.factor)
+    ramp.left -= count
+
+
 def record_of(mixer: Any) -> npt.NDArray[np.void]:
     """The MIXER record (1,) of a `server.rendering.mixing.Mixer`, which must outlive the record."""
     record = np.zeros(1, MIXER)
     record["slots"], record["block_size"] = mixer.dry.shape
     record["channels"] = mixer.output.shape[0]
-    for name in ("plays", "clip", "clip_samples", "clip_at", "clip_loops", "dry", "gain", "send", "fade_in", "output"):
+    for name in ("plays", "playback", "dry", "gain", "ramp", "send", "fade_in", "output"):
         record[name] = getattr(mixer, name).ctypes.data
     record["bus"] = 0 if mixer.bus is None else mixer.bus.address
     record["direct"] = 0 if mixer.direct_state is None else mixer.direct_state.address

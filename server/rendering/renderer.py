@@ -43,7 +43,7 @@ from server.rendering.mixer_set import MixerSet
 from server.rendering.mixing import Mixer, is_read_by_compiled_code
 from server.rendering.output import Output, Rendered, mix_all
 from server.rendering.partitions import BLOCK_SIZES, is_block_size, is_power_of_two
-from server.rendering.sources import Source
+from server.rendering.sources import FADE_SAMPLES, Source, is_over, stop_playback
 
 
 class UnknownEmitterError(NafirError):
@@ -264,7 +264,7 @@ class Renderer:
             raise RendererFullError("too many emitters removed just now still ring out")
         self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
         # guard: an emitter begins at its gain
-        self._mixer.gain[:, slot] = gain
+        self._mixer.set_gain(slot, gain)
         self._mixer.send[:, slot] = 1.0
 
     def remove_emitter(self, emitter_id: str) -> None:
@@ -277,11 +277,45 @@ class Renderer:
         self._changed = [other for other in self._changed if other is not emitter]
         self._mixers.leave(emitter.mixer, emitter.slot, has_played=emitter.has_played)
 
-    def set_gain(self, emitter_id: str, gain: float) -> None:
-        """Set a linear gain, reached by the end of the next block. Raises UnknownEmitterError, and ValueError for a
-        gain that would overflow."""
+    def set_gain(self, emitter_id: str, gain: float, *, ramp: int = 0) -> None:
+        """Set a linear gain, reached by the end of the next block or, linearly in decibels, over the next `ramp`
+        samples. An emitter that has not begun to play has it at once.
+
+        Raises UnknownEmitterError, and ValueError for a gain that would overflow, or a ramp from or to silence.
+        """
         emitter = self._emitter(emitter_id)
-        self._reach(emitter.mixer.gain, emitter, gain)
+        mixer, slot = emitter.mixer, emitter.slot
+        # guard: no gain is set that would overflow
+        require_gain(gain)
+        if ramp > 0 and min(gain, mixer.gain[1, slot]) <= 0:
+            raise ValueError("a ramp in decibels has a gain above 0 at either end")
+        if not emitter.has_played:
+            mixer.set_gain(slot, gain)
+        elif ramp > 0:
+            mixer.ramp_gain(slot, gain, ramp)
+        else:
+            mixer.reach_gain(slot, gain)
+
+    def stop_emitter(self, emitter_id: str, clock: int, *, fade: int = FADE_SAMPLES) -> None:
+        """Fade an emitter's clip out over `fade` samples from `clock` on, or from the next block if that is later; if
+        the clip has not begun by then, it is never heard. The newest call counts until the fade begins. Raises
+        UnknownEmitterError, and ValueError for a source that is no clip."""
+        emitter = self._emitter(emitter_id)
+        if not is_read_by_compiled_code(emitter.source):
+            raise ValueError(f"emitter {emitter_id!r} plays no clip")
+        if emitter.has_played:
+            record = emitter.mixer.playback_of(emitter.slot, emitter.source)
+            stop_playback(record, stops_in=clock - self.sample_clock, fade=fade)
+        else:
+            emitter.source.stop(clock, fade)
+
+    def has_ended(self, emitter_id: str) -> bool:
+        """Whether an emitter's clip is over and has rung out. Raises UnknownEmitterError."""
+        emitter = self._emitter(emitter_id)
+        if not (emitter.has_played and is_read_by_compiled_code(emitter.source)):
+            return False
+        mixer, slot = emitter.mixer, emitter.slot
+        return is_over(mixer.playback_of(slot, emitter.source)) and mixer.is_quiet(slot)
 
     def set_reverberation_gain(self, emitter_id: str, gain: float) -> None:
         """Set an additional linear gain for the convolved sound only, reached by the end of the next block: a
@@ -289,13 +323,10 @@ class Renderer:
         emitter = self._emitter(emitter_id)
         emitter.send = gain
         if emitter.has_ir or not emitter.has_played:
-            self._reach(emitter.mixer.send, emitter, gain)
-
-    def _reach(self, gains: FloatArray, emitter: _Emitter, gain: float) -> None:
-        # guard: no gain is set that would overflow
-        gains[1, emitter.slot] = require_gain(gain)
-        if not emitter.has_played:
-            gains[0, emitter.slot] = gain
+            sends = emitter.mixer.send
+            sends[1, emitter.slot] = require_gain(gain)
+            if not emitter.has_played:
+                sends[0, emitter.slot] = gain
 
     def set_ir(self, emitter_id: str, ir: npt.NDArray[np.floating] | PartitionedIr, token: int | None = None) -> None:
         """Set the IR from the next block on. This starts the emitter or, if it is already playing, crossfades to the
@@ -397,6 +428,8 @@ class Renderer:
                 emitter.token = emitter.next_token
                 if not emitter.has_played:
                     emitter.has_played = True
+                    if is_read_by_compiled_code(emitter.source):
+                        emitter.source.begin(self.sample_clock)
                     emitter.mixer.play(emitter.slot, emitter.source)
         self._changed.clear()
         return self._output, list(self._mixers)
@@ -417,7 +450,7 @@ class Renderer:
         if slot is None:
             raise RendererFullError("too many emitters heard this way before still ring out")
         before, from_slot = emitter.mixer, emitter.slot
-        mixer.gain[:, slot] = before.gain[1, from_slot]
+        mixer.gain[:, slot], mixer.ramp[slot] = before.gain[1, from_slot], before.ramp[from_slot]
         mixer.send[:, slot] = emitter.send
         if mixer.direct is not None and before.direct is not None:
             mixer.direct.copy_slot(slot, before.direct, from_slot)

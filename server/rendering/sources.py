@@ -1,9 +1,12 @@
 """Sources of an emitter's dry signal: a clip, or live samples from a client.
 
 Samples are mono float32 at the scene's rate, full scale 1. A source fills one block at a time, on the rendering thread.
+
+Where a clip is and when it starts and stops is one `PLAYBACK` record. Compiled code (`server.rendering.mixing_kernel`)
+plays a copy of it; `ClipPlayer` does the same in NumPy.
 """
 
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -26,37 +29,132 @@ class Source(Protocol):
         """Start again from the beginning."""
 
 
-class ClipPlayer:
-    """Plays mono samples (n,), n >= 1, block by block: once followed by silence, or in a loop without a gap.
+NEVER: Final = 2**62
+"""Samples until something that does not happen."""
 
-    An array is checked here (`server.rendering.ingest`), which takes a while if it is long.
+PLAYBACK = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "clip",  # address of float32 samples; 0 if Python fills the row
+            "samples",  # of the clip
+            "at",  # next sample
+            "loop_start",
+            "loop_end",  # 0: the clip is played once
+            "starts_in",  # samples from the next block's first until the clip begins; negative once it has
+            "fade_in",  # length of the fade with which it begins, 0 for none
+            "stops_in",  # samples from the next block's first until it fades out; negative once it does
+            "fade_out",  # length of the fade with which it stops
+        )
+    ]
+)
+
+
+class ClipPlayer:
+    """Plays mono samples (n,), n >= 1, block by block: from `offset` on, once followed by silence, or in a loop without
+    a gap from `loop_start` to `loop_end` (exclusive; by default the clip's ends).
+
+    Where it starts in the middle of the clip, it fades in over `FADE_SAMPLES`. `starts_at` and `stop` count by the
+    clock that `begin` tells, or from the first block. An array is checked here (`server.rendering.ingest`), which takes
+    a while if it is long. Raises ValueError for an `offset` or a loop outside the clip.
     """
 
-    def __init__(self, clip: DryAudio | FloatArray, *, loop: bool) -> None:
+    def __init__(
+        self,
+        clip: DryAudio | FloatArray,
+        *,
+        loop: bool,
+        offset: int = 0,
+        loop_start: int = 0,
+        loop_end: int | None = None,
+        starts_at: int = 0,
+    ) -> None:
         audio = clip if isinstance(clip, DryAudio) else DryAudio(clip)
         if audio.size == 0:
             raise ValueError("a clip is mono and not empty, got no samples")
         # guard: a caller's array goes through the door
         self.clip = audio.samples
         self.loop = loop
-        self._position = 0
+        self._starts_at, self._stops_at = starts_at, NEVER
+        end = audio.size if loop_end is None or not loop else loop_end
+        if not 0 <= loop_start < end <= audio.size:
+            raise ValueError(f"a loop from sample {loop_start} to {end} is none in a clip of {audio.size} samples")
+        if not 0 <= offset < end:
+            raise ValueError(f"offset {offset} is not among the {end} samples that are played")
+        self._offset = offset
+        self._fade = raised_cosine(FADE_SAMPLES)
+        self._records = np.zeros(1, PLAYBACK)
+        self.playback: np.void = self._records[0]
+        """The PLAYBACK record, as of the next block."""
+        self.playback["clip"], self.playback["samples"] = self.clip.ctypes.data, audio.size
+        self.playback["loop_start"], self.playback["loop_end"] = loop_start, end if loop else 0
+        self.playback["fade_in"] = FADE_SAMPLES if offset else 0
+        self.playback["fade_out"] = FADE_SAMPLES
+        self.reset()
+
+    def stop(self, clock: int, fade: int) -> None:
+        """Fade out over `fade` samples from `clock` on: before `begin`, which tells the clock."""
+        self._stops_at, self.playback["fade_out"] = clock, fade
+
+    def begin(self, clock: int) -> None:
+        """Say the clock of the next block's first sample. A clip that was to start earlier starts now, and one that was
+        to stop before it starts is over."""
+        self.playback["starts_in"], self.playback["stops_in"] = max(0, self._starts_at - clock), NEVER
+        stop_playback(self.playback, stops_in=self._stops_at - clock, fade=int(self.playback["fade_out"]))
 
     def process(self, out: FloatArray) -> None:
         """Fill `out` (b,) with the next samples."""
-        written = 0
+        record = self.playback
+        waits = min(max(int(record["starts_in"]), 0), out.size)
+        out[:waits] = 0
+        self._read(out[waits:], record)
+        played = waits - int(record["starts_in"])
+        if played < record["fade_in"]:
+            rising = out[waits : waits + FADE_SAMPLES - played]
+            rising *= self._fade[played : played + rising.size]
+        if record["stops_in"] < out.size:
+            falling = out[max(0, int(record["stops_in"])) :]
+            falling *= _fade_out(np.arange(out.size - falling.size, out.size) - record["stops_in"], record["fade_out"])
+        record["starts_in"] -= out.size
+        record["stops_in"] -= out.size
+
+    def _read(self, out: FloatArray, record: np.void) -> None:
+        written, at, end = 0, int(record["at"]), int(record["loop_end"]) or self.clip.size
         while written < out.size:
-            piece = self.clip[self._position : self._position + out.size - written]
+            piece = self.clip[at : min(end, at + out.size - written)]
             if piece.size == 0:  # a clip that does not loop is over
                 out[written:] = 0
-                return
+                break
             out[written : written + piece.size] = piece
             written += piece.size
-            self._position += piece.size
-            if self.loop and self._position == self.clip.size:
-                self._position = 0
+            at += piece.size
+            if record["loop_end"] and at == end:
+                at = int(record["loop_start"])
+        record["at"] = at
 
     def reset(self) -> None:
-        self._position = 0
+        self.playback["at"] = self._offset
+        self.begin(0)
+
+
+def _fade_out(since: npt.NDArray[np.int64], samples: int) -> FloatArray:
+    """Gains of samples `since` the beginning of a fade-out over so many samples."""
+    phase = np.pi * np.minimum((since + 0.5) / samples, 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(phase), np.float32)
+
+
+def stop_playback(record: np.void, *, stops_in: int, fade: int) -> None:
+    """Let what a PLAYBACK record plays fade out over `fade` samples, >= 1, from `stops_in` samples after the next
+    block's first on. What has not started by then is over. Once a fade-out has begun this changes nothing."""
+    if record["stops_in"] >= 0:
+        is_heard = record["starts_in"] < 0 or record["starts_in"] < stops_in
+        record["stops_in"], record["fade_out"] = max(0, stops_in) if is_heard else -fade, fade
+
+
+def is_over(record: np.void) -> bool:
+    """Whether a PLAYBACK record plays nothing any more."""
+    is_played = record["starts_in"] <= 0 and not record["loop_end"] and record["at"] == record["samples"]
+    return bool(is_played or record["stops_in"] <= -record["fade_out"])
 
 
 class LiveSource:

@@ -82,6 +82,14 @@ class Validity:
         return self.circumstances == circumstances and self.around.holds(listener)
 
 
+@dataclass(frozen=True)
+class Ramp:
+    """A gain on its way to `gain_db`, which it reaches at the clock `ends_at`."""
+
+    ends_at: int
+    gain_db: float
+
+
 @dataclass
 class StreamedEmitter:
     """One emitter of a stream. `state` follows the client and the plan; `heard` is what the renderer has. Code that
@@ -98,13 +106,28 @@ class StreamedEmitter:
     turns out to be the same."""
     is_displaced: bool = True
     """Whether the renderer has the direct path of an earlier state."""
+    starts_at: int = 0
+    """Clock from which its clip is heard, unless it becomes audible later."""
+    ends: bool = False
+    """Whether it will have been heard to its end some time, of which the client is not informed yet."""
+    remove_when_ended: bool = False
+    ramp: "Ramp | None" = None
 
     @classmethod
     def added_by(
         cls, message: AddEmitter, serial: int, live: "LiveInput | None", stage: Stage = Stage.DECIDED
     ) -> "StreamedEmitter":
         pattern = OMNIDIRECTIONAL if message.directivity is None else message.directivity.directivity
-        return cls(serial, EmitterState(message.pose, pattern, EVERYTHING, message.gain_db), live, stage)
+        state = EmitterState(message.pose, pattern, EVERYTHING, message.gain_db)
+        return cls(
+            serial,
+            state,
+            live,
+            stage,
+            starts_at=message.start_at or 0,
+            ends=live is None and (not message.loop or message.stop_at is not None),
+            remove_when_ended=message.remove_when_ended,
+        )
 
     @property
     def effects(self) -> EmitterEffects:
@@ -137,8 +160,16 @@ class StreamedEmitter:
         pose = message.pose if message.has_front else Pose(message.position, self.state.pose.orientation)
         self.state = replace(self.state, pose=pose)
 
-    def set_gain(self, gain_db: float) -> None:
-        self.state = replace(self.state, gain_db=gain_db)
+    def set_gain(self, gain_db: float, *, ramp_ends: int | None = None) -> None:
+        """Note a gain, which is reached at the clock `ramp_ends` or now. During a ramp plans go by its louder end."""
+        self.ramp = None if ramp_ends is None else Ramp(ramp_ends, gain_db)
+        louder_db = gain_db if ramp_ends is None else max(gain_db, self.state.gain_db)
+        self.state = replace(self.state, gain_db=louder_db)
+
+    def follow_ramp(self, clock: int) -> None:
+        """Note the gain of a ramp that has ended by `clock`."""
+        if self.ramp is not None and self.ramp.ends_at <= clock:
+            self.set_gain(self.ramp.gain_db)
 
     def set_effects(self, effects: EmitterEffects) -> None:
         self.state = replace(self.state, effects=effects)

@@ -333,7 +333,10 @@ class ResponseScheduler:
         """Return messages that these emitters are audible from the next block on, for those not announced before."""
         clock = self._renderer.sample_clock
         news = [identifier for identifier in identifiers if self._emitters[identifier].announce()]
-        return [EmitterAdded(id=identifier, sample_clock=clock) for identifier in news]
+        return [
+            EmitterAdded(id=identifier, sample_clock=max(clock, self._emitters[identifier].starts_at))
+            for identifier in news
+        ]
 
     def _has_applied_all(self) -> bool:
         return all(

@@ -34,14 +34,23 @@ from server.protocol.client_messages import (
     RemoveEmitter,
     SetEffects,
     SetGain,
+    StopEmitter,
     emitter_of,
 )
-from server.protocol.server_messages import EmitterRemoved, Error, LevelReason, LiveStatus, PlanChanged, ServerMessage
+from server.protocol.server_messages import (
+    EmitterEnded,
+    EmitterRemoved,
+    Error,
+    LevelReason,
+    LiveStatus,
+    PlanChanged,
+    ServerMessage,
+)
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.output import Rendered
 from server.rendering.renderer import DuplicateEmitterError, RendererFullError, render_all
-from server.rendering.sources import ClipPlayer, Source
+from server.rendering.sources import ClipPlayer, FloatArray, Source
 from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import IrRequest, IrResponse
 from server.responses.radiation import reverberation_gain
@@ -54,6 +63,9 @@ from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
 from server.streaming.quality_steps import QualityStep
 from server.streaming.response_scheduler import ResponseScheduler, Scope
+
+STOP_FADE_S = 0.01
+"""The fade of a clip at its `stop_at`."""
 
 
 def _start_pose(bundle: Bundle) -> Pose:
@@ -194,8 +206,9 @@ class Session:
                 case AddEmitter():
                     self._add_emitter(message)
                 case SetGain():
-                    self._require_emitter(message.id).set_gain(message.gain_db)
-                    self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)))
+                    self._set_gain(message)
+                case StopEmitter():
+                    self._stop_emitter(message)
                 case DryBlock():
                     self._push(message)
                 case SetEffects():
@@ -318,6 +331,19 @@ class Session:
         sample_clock = self.sample_clock
         return next(iter(self.finish_blocks(sample_clock, render_all([self.renderer]))), None)
 
+    def follow_clock(self) -> list[ServerMessage]:
+        """Note what has come to its end by the next block; remove the emitters that were to be removed then."""
+        events: list[ServerMessage] = []
+        for identifier, emitter in tuple(self._emitters.items()):
+            emitter.follow_ramp(self.sample_clock)
+            if emitter.ends and self.renderer.has_ended(identifier):
+                emitter.ends = False
+                is_removed = emitter.remove_when_ended
+                events.append(EmitterEnded(id=identifier, sample_clock=self.sample_clock, removed=is_removed))
+                if is_removed:
+                    events += self._forget_emitter(identifier)
+        return events
+
     def live_statuses(self) -> tuple[LiveStatus, ...]:
         return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)
 
@@ -390,9 +416,53 @@ class Session:
 
     def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
         if message.clip is not None:
-            return None, ClipPlayer(self._load_clip(message.clip), loop=message.loop)
+            return None, self._open_clip(message, self._load_clip(message.clip))
         live = LiveInput.opened(message.id, sample_rate=self._sample_rate, block_size=self.renderer.block_size)
         return live, live.source
+
+    def _open_clip(self, message: AddEmitter, clip: DryAudio | FloatArray) -> ClipPlayer:
+        """Raises RequestError outside_clip."""
+
+        def samples(seconds: float) -> int:
+            return round(seconds * self._sample_rate)
+
+        end = clip.size if message.loop_end_s is None else samples(message.loop_end_s)
+        places = (
+            ("loop_end_s", end <= clip.size),
+            ("loop_start_s", samples(message.loop_start_s) < end),
+            ("offset_s", samples(message.offset_s) < end),
+        )
+        for field, is_inside in places:
+            if not is_inside:
+                lasts = f"clip {message.clip!r} lasts {clip.size / self._sample_rate:g} s"
+                problem = f"{field}: {getattr(message, field):g} s is no place in what is played: {lasts}"
+                if field != "loop_end_s" and message.loop_end_s is not None:
+                    problem += f", and the loop ends at {message.loop_end_s:g} s"
+                raise RequestError("outside_clip", problem, field=field)
+        player = ClipPlayer(
+            clip,
+            loop=message.loop,
+            offset=samples(message.offset_s),
+            loop_start=samples(message.loop_start_s),
+            loop_end=end,
+            starts_at=message.start_at or 0,
+        )
+        if message.stop_at is not None:
+            player.stop(message.stop_at, samples(STOP_FADE_S))
+        return player
+
+    def _set_gain(self, message: SetGain) -> None:
+        emitter, ramp = self._require_emitter(message.id), round(message.ramp_s * self._sample_rate)
+        self.renderer.set_gain(message.id, float(db_to_amplitude(message.gain_db)), ramp=ramp)
+        emitter.set_gain(message.gain_db, ramp_ends=self.sample_clock + ramp if ramp else None)
+
+    def _stop_emitter(self, message: StopEmitter) -> None:
+        emitter = self._require_emitter(message.id)
+        if emitter.live is not None:
+            raise RequestError("is_live", f"emitter {message.id!r} is live: remove it", field="id")
+        clock = self.sample_clock if message.stop_at is None else message.stop_at
+        self.renderer.stop_emitter(message.id, clock, fade=max(1, round(message.fade_s * self._sample_rate)))
+        emitter.ends |= not self.renderer.has_ended(message.id)
 
     def _push(self, block: DryBlock) -> None:
         live = self._require_emitter(block.id).live
@@ -402,12 +472,15 @@ class Session:
 
     def _remove_emitter(self, message: RemoveEmitter) -> list[ServerMessage]:
         self._require_emitter(message.id)
-        del self._emitters[message.id]
+        return [EmitterRemoved(id=message.id), *self._forget_emitter(message.id)]
+
+    def _forget_emitter(self, identifier: str) -> list[ServerMessage]:
+        del self._emitters[identifier]
         if self._effects.planned is not None:
-            self._effects.planned.forget_emitter(message.id)
-        self.renderer.remove_emitter(message.id)
+            self._effects.planned.forget_emitter(identifier)
+        self.renderer.remove_emitter(identifier)
         self._responses.retry()
-        return [EmitterRemoved(id=message.id), *self._responses.change_quality_unheard()]
+        return self._responses.change_quality_unheard()
 
     def _require_emitter(self, identifier: str) -> StreamedEmitter:
         if identifier not in self._emitters:

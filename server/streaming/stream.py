@@ -365,6 +365,7 @@ class Stream:
         self.due_s = clock.due_s(self.next_block)
         if len(blocks) < count:
             self._note_full(now_s)
+        outgoing += self.session.follow_clock()
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
             outgoing += self.session.complaints()

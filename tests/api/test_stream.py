@@ -18,6 +18,7 @@ from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter
 from server.protocol.server_messages import (
     EmitterAdded,
+    EmitterEnded,
     EmitterRemoved,
     Error,
     Pong,
@@ -126,6 +127,24 @@ def test_from_hello_to_sound(ears):
     ears.send(RemoveEmitter(id="talker"))
     assert ears.until(EmitterRemoved).id == "talker"
     ears.until(AudioBlock, lambda block: not block.samples.any())
+
+
+def test_a_sound_that_has_ended_makes_room_for_the_next(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket)
+        (place,) = client.app_state["host"].admission._places
+        for number in range(2):
+            start_at = ears.until(AudioBlock).sample_clock + 4_800
+            door = TALKER.model_copy(
+                update={"loop": False, "offset_s": 0.95, "start_at": start_at, "remove_when_ended": True}
+            )
+            ears.send(door)
+            assert ears.until(EmitterAdded).sample_clock == start_at
+            assert place.emitters == 1, number
+            ended = ears.until(EmitterEnded)
+            assert ended.removed
+            assert ended.sample_clock > start_at + 1_200
+            assert place.emitters == 0
 
 
 def test_turning_the_head_swaps_the_louder_ear(ears):

@@ -27,11 +27,13 @@ from server.protocol.client_messages import (
     RemoveEmitter,
     SetGain,
     SetLevel,
+    StopEmitter,
     parse_client_message,
 )
 from server.protocol.server_messages import (
     Durations,
     EmitterAdded,
+    EmitterEnded,
     EmitterRemoved,
     Error,
     LevelChanged,
@@ -66,7 +68,14 @@ CLIENT_MESSAGES = [
     ),
     MoveEmitter(id="talker", position=(1, 2, 3), pose_id=2**32 - 1),
     MoveEmitter(id="talker", position=(1, 2, 3), yaw=0.0, pose_id=1),
+    AddEmitter(id="talker", clip="speech", position=(1, 2, 3), loop=False, start_at=2**53 - 1, remove_when_ended=True),
+    AddEmitter(
+        id="talker", clip="speech", position=(1, 2, 3), offset_s=0.5, loop_start_s=0.25, loop_end_s=1, stop_at=5
+    ),
+    StopEmitter(id="talker"),
+    StopEmitter(id="talker", stop_at=48_000, fade_s=0.5),
     SetGain(id="talker", gain_db=-80),
+    SetGain(id="talker", gain_db=6, ramp_s=2.5),
     SetLevel(level="fast"),
     RemoveEmitter(id="talker"),
     ListenerPose(pose_id=4, position=(1, 2, 3), yaw=-math.pi),
@@ -77,6 +86,7 @@ CLIENT_MESSAGES = [
 
 SERVER_MESSAGES = [
     EmitterAdded(id="talker", sample_clock=512),
+    EmitterEnded(id="talker", sample_clock=1_024, removed=True),
     EmitterRemoved(id="talker"),
     LevelChanged(level="fast", reason="load", ir_rate_hz=5.0, shared_tail=True, sample_clock=512),
     Status(
