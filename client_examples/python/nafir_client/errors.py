@@ -80,3 +80,7 @@ class ClosedError(NafirClientError):
 
 class ClipError(NafirClientError):
     """An audio file cannot be read."""
+
+
+class DeviceError(NafirClientError):
+    """The sound card cannot be opened."""

@@ -54,6 +54,26 @@ class StreamOptions(TypedDict, total=False):
     listener: Pose
 
 
+class EmitterOptions(TypedDict, total=False):
+    """What may be said of an emitter when it is added.
+
+    With a `clip` it plays one of the server's, with `loop` (the default) again and again. Without one it is live: it
+    plays what is written to it, of which `ahead_blocks` (4) are kept waiting at the server. Without a `position` it is
+    where the scene suggests. `yaw` or `orientation` turn it, which matters with a `directivity` only. `id` is its name
+    in messages of the server; without one it gets one.
+    """
+
+    clip: str
+    loop: bool
+    position: Iterable[float]
+    yaw: float
+    orientation: Iterable[float]
+    gain_db: float
+    directivity: Mapping[str, Any]
+    id: str
+    ahead_blocks: int
+
+
 class SessionEmitter:
     """An emitter as it should be: the fields of its `add_emitter`, kept up to date."""
 

@@ -34,7 +34,7 @@ from nafir_client.errors import (
 from nafir_client.live_input import LiveInput
 from nafir_client.pose import Pose, Position
 from nafir_client.scene import Scene, Welcome
-from nafir_client.session import Message, Session, SessionEmitter, StreamOptions, refusal
+from nafir_client.session import EmitterOptions, Message, Session, SessionEmitter, StreamOptions, refusal
 from nafir_client.stream_statistics import StreamStatistics
 from nafir_client.wire import Block
 
@@ -120,6 +120,10 @@ class Emitter:
         """
         await self._stream.write(self._state, samples)
 
+    def require_live(self) -> None:
+        """Raises ValueError for an emitter that plays a clip."""
+        _live(self._state)
+
     def offer(self, samples: npt.ArrayLike) -> None:
         """The same without waiting, as a microphone needs it: beyond a second the oldest samples are dropped."""
         self._stream.offer(self._state, samples)
@@ -143,7 +147,7 @@ class Stream:
         self._session = session
         self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
         self._backoff = reconnect
-        self._patience_s = patience_s
+        self.patience_s = patience_s
         self._on_message = on_message
         self._blocks: deque[Block] = deque()
         self._has_news = asyncio.Event()
@@ -158,7 +162,7 @@ class Stream:
 
     async def __aenter__(self) -> Self:
         started_s = time.monotonic()
-        socket = await self._connect_again(Backoff(give_up_after_s=self._patience_s), started_s, None)
+        socket = await self._connect_again(Backoff(give_up_after_s=self.patience_s), started_s, None)
         self._task = asyncio.create_task(self._run(socket))
         return self
 
@@ -236,40 +240,13 @@ class Stream:
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
         return await self.change(lambda session: session.move_listener(pose, time.monotonic()))
 
-    async def add_emitter(
-        self,
-        *,
-        clip: str | None = None,
-        position: Iterable[float] | None = None,
-        yaw: float | None = None,
-        orientation: Iterable[float] | None = None,
-        gain_db: float = 0.0,
-        loop: bool = True,
-        directivity: Mapping[str, Any] | None = None,
-        id: str | None = None,  # noqa: A002  the field's name
-        ahead_blocks: int = 4,
-    ) -> Emitter:
-        """Add an emitter and return once it is heard. Without a clip it is live: it plays what is written to it, of
-        which `ahead_blocks` are kept waiting at the server. Without a position it is where the scene suggests.
-
-        Raises RefusedError, or another NafirClientError if the stream ends first.
-        """
-        identifier = id if id is not None else self._free_id()
-        pose = Pose.of(self.scene.emitter.position if position is None else position, yaw=yaw, orientation=orientation)
-        fields: dict[str, Any] = {"id": identifier, "position": pose.position, "gain_db": gain_db}
-        if yaw is not None or orientation is not None:
-            fields["orientation"] = pose.orientation
-        if directivity is not None:
-            fields["directivity"] = dict(directivity)
-        fields.update({"live": True} if clip is None else {"clip": clip, "loop": loop})
-        block_size = self.block_size
-        live = None
-        if clip is None:
-            ahead = ahead_blocks * block_size
-            live = LiveInput(block_size, ahead=ahead, longest=ahead + round(_LIVE_S * self.sample_rate))
+    async def add_emitter(self, **options: Unpack[EmitterOptions]) -> Emitter:
+        """Add an emitter and return once it is heard. Raises RefusedError, or another NafirClientError if the stream
+        ends first."""
+        fields, live = self._emitter_fields(options)
         added = asyncio.get_running_loop().create_future()
         state = await self.change(lambda session: session.add_emitter(fields, live))
-        self._adding[identifier] = added
+        self._adding[state.id] = added
         try:
             await added
         except BaseException:
@@ -277,7 +254,7 @@ class Stream:
             self._has_outgoing.set()
             raise
         finally:
-            self._adding.pop(identifier, None)
+            self._adding.pop(state.id, None)
         return Emitter(self, state)
 
     async def set_level(self, level: str) -> None:
@@ -328,6 +305,24 @@ class Stream:
         done = put(self._session)
         self._has_outgoing.set()
         return done
+
+    def _emitter_fields(self, options: EmitterOptions) -> tuple[dict[str, Any], LiveInput | None]:
+        """The fields of an `add_emitter`, and where samples wait if it is live."""
+        yaw, orientation = options.get("yaw"), options.get("orientation")
+        pose = Pose.of(options.get("position", self.scene.emitter.position), yaw=yaw, orientation=orientation)
+        fields: dict[str, Any] = {"id": options.get("id") or self._free_id(), "position": pose.position}
+        if yaw is not None or orientation is not None:
+            fields["orientation"] = pose.orientation
+        if "gain_db" in options:
+            fields["gain_db"] = options["gain_db"]
+        if "directivity" in options:
+            fields["directivity"] = dict(options["directivity"])
+        clip = options.get("clip")
+        if clip is not None:
+            return {**fields, "clip": clip, "loop": options.get("loop", True)}, None
+        ahead = options.get("ahead_blocks", 4) * self.block_size
+        live = LiveInput(self.block_size, ahead=ahead, longest=ahead + round(_LIVE_S * self.sample_rate))
+        return {**fields, "live": True}, live
 
     def _free_id(self) -> str:
         return next(name for number in self._numbers if (name := f"emitter-{number}") not in self._session.emitters)
