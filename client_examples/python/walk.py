@@ -21,6 +21,8 @@ POSES_PER_SECOND = 30
 
 
 async def listen(arguments: argparse.Namespace) -> None:
+    path, recording = PathAsHeard(), Recording()
+
     def note(message: nafir_client.Message) -> None:
         path.note_message(message)
         if message["type"] == "level_changed":
@@ -41,19 +43,18 @@ async def listen(arguments: argparse.Namespace) -> None:
     stream = nafir_client.connect(arguments.url, reconnect=None, on_message=note, **wishes)
     async with stream:
         print(f"level {stream.level}")
-        path, recording, walk = PathAsHeard(stream.level), Recording(), Walk.through(stream.scene, arguments.seconds)
+        walk = Walk.through(stream.scene, arguments.seconds)
         await go(0)  # before the clip is added, so that it begins with this pose and not with the scene's
         clip = await stream.add_emitter(clip=arguments.clip)
         walking = asyncio.create_task(stroll())
         async for block in stream:
             recording.add(block)
-            if block.sample_clock >= clip.start_clock:
-                path.note_block(block)
+            path.note_block(block)
             if recording.frames - clip.start_clock >= arguments.seconds * stream.sample_rate:
                 break
         walking.cancel()
 
-    rate, rows = stream.sample_rate, path.write(arguments.path)
+    rate, rows = stream.sample_rate, path.write(arguments.path, clip.start_clock, stream.welcome.level)
     write_wav(arguments.output, recording.samples(), rate)
     print(f"{arguments.output}: {recording.frames / rate:.2f} s; {arguments.path}: {rows} poses")
     waits = stream.statistics

@@ -18,6 +18,7 @@ import typer
 from server.bench import cli as bench
 from server.bench.capacity_cli import plan_capacity
 from server.cli import keys
+from server.cli.listen import listen
 from server.core.command_line import StrictTyper, figure_file, require_at_most_one, writable_file
 from server.core.errors import NafirError, RequestError
 from server.core.files import require_readable
@@ -48,6 +49,7 @@ app.add_typer(keys.app, name="keys")
 app.command()(plan_capacity)
 app.command()(check)
 app.command()(soak)
+app.command()(listen)
 app.command()(listening_test)
 app.command()(listening_results)
 

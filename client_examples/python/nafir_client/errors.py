@@ -1,5 +1,8 @@
 """What can go wrong between a client and its server. The text of every error fits on one line."""
 
+ACCESS_ENDED = 4401
+"""The close code for a key or token that has expired or was revoked."""
+
 
 class NafirClientError(Exception):
     """Base class of all errors of this package."""
@@ -60,7 +63,7 @@ class ConnectionLostError(NafirClientError):
     @property
     def is_passing(self) -> bool:
         """Whether a new connection may do better: the fault was not what this client had said or done."""
-        return self.close_code not in {1000, 1002, 1003, 1007, 1008, 1009, 1010}
+        return self.close_code not in {1000, 1002, 1003, 1007, 1008, 1009, 1010, ACCESS_ENDED}
 
 
 class ProtocolError(NafirClientError):

@@ -61,54 +61,66 @@ class Recording:
 class PathAsHeard:
     """From which sample on each pose and each quality level was heard.
 
-    `nafir render --path` makes the same sound from the file that `write` makes. Poses have to be noted by their ids
-    before blocks name them.
+    `nafir render --path` makes the same sound from the file that `write` makes.
     """
 
-    def __init__(self, level: str) -> None:
+    def __init__(self) -> None:
         self._poses: dict[int, Pose] = {}
-        self._levels = {0: level}
-        """Quality level by its first sample."""
-        self._direct: dict[int, int] = {}
-        """First sample of the direct sound by pose id."""
-        self._reverberation: dict[int, int] = {}
-        """Pose id by the first sample of its reverberation."""
+        self._levels: dict[int, str] = {}
+        """Quality level by its first sample, of those that were not the first."""
+        self._heard: list[tuple[int, int, int]] = []
+        """The clock of each block, and the pose ids of its direct sound and of its reverberation."""
 
     def note_pose(self, pose_id: int, pose: Pose) -> None:
         self._poses[pose_id] = pose
 
     def note_message(self, message: Message) -> None:
-        if message["type"] == "level_changed" and message["level"] != next(reversed(self._levels.values())):
+        if message["type"] == "level_changed":
             self._levels[message["sample_clock"]] = message["level"]
 
     def note_block(self, block: Block) -> None:
-        self._direct.setdefault(block.pose_id, block.sample_clock)
-        if block.reverberation_pose_id != next(reversed(self._reverberation.values()), None):
-            self._reverberation[block.sample_clock] = block.reverberation_pose_id
+        self._heard.append((block.sample_clock, block.pose_id, block.reverberation_pose_id))
 
-    def rows(self) -> list[Row]:
-        """Pose id, sample of the direct sound, and sample and level of the reverberation (or empty), in rising order.
+    def rows(self, start_clock: int, level: str) -> list[Row]:
+        """Pose id, sample of the direct sound, and sample and level of the reverberation (or empty), in rising order,
+        for a stream that began with `level` and whose first emitter began at `start_clock`.
 
         A pose whose reverberation was heard at two levels has two rows.
         """
-        heard: dict[int, list[tuple[int, str]]] = {}
+        direct: dict[int, int] = {}
+        reverberation: dict[int, int] = {}
+        for clock, pose, reverberation_pose in self._heard:
+            if clock < start_clock:
+                continue
+            direct.setdefault(pose, clock)
+            if reverberation_pose != next(reversed(reverberation.values()), None):
+                reverberation[clock] = reverberation_pose
+        levels = {0: level}
+        for clock, name in self._levels.items():
+            if name != next(reversed(levels.values())):  # otherwise only the rate of responses has changed
+                levels[clock] = name
+        return self._merged(direct, reverberation, levels)
+
+    def _merged(self, direct: dict[int, int], reverberation: dict[int, int], levels: dict[int, str]) -> list[Row]:
+        """Rows from the first sample of each pose's direct sound, the pose by the first sample of its reverberation,
+        and the level by its first sample."""
+        heard: dict[int, list[tuple[int | str, str]]] = {}
         pose, level = None, ""
-        for sample in sorted(self._reverberation.keys() | self._levels.keys()):
-            pose, level = self._reverberation.get(sample, pose), self._levels.get(sample, level)
+        for sample in sorted(reverberation.keys() | levels.keys()):
+            pose, level = reverberation.get(sample, pose), levels.get(sample, level)
             if pose is not None:
                 heard.setdefault(pose, []).append((sample, level))
         rows: list[Row] = []
-        for pose in sorted(self._direct.keys() | heard.keys()):
+        for pose in sorted(direct.keys() | heard.keys()):
             # A pose that a newer one replaced within a block was never heard directly. It gets the sample of the newer
             # one, whose row comes later and counts.
-            sample = self._direct.get(pose, min(at for newer, at in self._direct.items() if newer >= pose))
-            reverberation: list[tuple[int | str, str]] = [*heard.get(pose, [("", "")])]
-            rows += [(pose, sample, *each) for each in reverberation]
+            sample = direct.get(pose, min(at for newer, at in direct.items() if newer >= pose))
+            rows += [(pose, sample, *each) for each in heard.get(pose, [("", "")])]
         return rows
 
-    def write(self, path: Path | str) -> int:
-        """Write a CSV file. Returns how many rows it has."""
-        rows = self.rows()
+    def write(self, path: Path | str, start_clock: int, level: str) -> int:
+        """Write the rows as a CSV file. Returns how many there are."""
+        rows = self.rows(start_clock, level)
         with Path(path).open("w", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow(["sample", "reverberation_sample", "level", "x", "y", "z", "qx", "qy", "qz", "qw"])

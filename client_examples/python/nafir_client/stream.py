@@ -363,7 +363,8 @@ class Stream:
             raise UnreachableError(self.url, str(exc) or type(exc).__name__) from exc
         try:
             async with asyncio.timeout(_WELCOME_S):
-                await socket.send(self._session.hello())
+                with contextlib.suppress(ConnectionClosed):  # a server that is not ready says so before it goes
+                    await socket.send(self._session.hello())
                 self._session.greet(await socket.recv(), time.monotonic())
         except ConnectionClosed as exc:
             raise _lost(self.url, exc, None) from exc

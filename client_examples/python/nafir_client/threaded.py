@@ -8,7 +8,6 @@
 """
 
 import asyncio
-import contextlib
 import threading
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import Future
@@ -88,11 +87,11 @@ class ThreadedEmitter:
 
     def move(
         self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
-    ) -> None:
-        """Move it; without yaw and orientation its front keeps its direction."""
+    ) -> "Future[int]":
+        """Move it; without yaw and orientation its front keeps its direction. The future has the pose's id."""
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
         turned = None if yaw is None and orientation is None else pose.orientation
-        self._stream.run_later(lambda: self._emitter.move(pose.position, orientation=turned))
+        return self._stream.run_later(lambda: self._emitter.move(pose.position, orientation=turned))
 
     def set_gain(self, gain_db: float) -> None:
         self._stream.run_later(lambda: self._emitter.set_gain(gain_db))
@@ -129,7 +128,7 @@ class ThreadedStream:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="nafir-client", daemon=True)
         self._receiving: Future[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[Any]] = set()
         self.failure: NafirClientError | None = None
         """Why nothing more will come; None while the stream is open."""
 
@@ -208,11 +207,11 @@ class ThreadedStream:
 
     def move_listener(
         self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
-    ) -> None:
-        """Move the listener, as often as you like: the newest pose counts."""
+    ) -> "Future[int]":
+        """Move the listener, as often as you like: the newest pose counts. The future has the pose's id."""
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
         self._orientation = pose.orientation
-        self.run_later(lambda: self._stream.move_listener(pose.position, orientation=pose.orientation))
+        return self.run_later(lambda: self._stream.move_listener(pose.position, orientation=pose.orientation))
 
     def add_emitter(self, **options: Unpack[EmitterOptions]) -> ThreadedEmitter:
         """Add an emitter and wait until it is heard, some milliseconds. Raises RefusedError, another NafirClientError
@@ -221,7 +220,7 @@ class ThreadedStream:
 
     def add_emitter_later(self, **options: Unpack[EmitterOptions]) -> "Future[ThreadedEmitter]":
         """The same without waiting."""
-        return asyncio.run_coroutine_threadsafe(self._add(options), self._loop)
+        return self.run_later(lambda: self._add(options))
 
     def set_level(self, level: str) -> None:
         """Choose a quality level, or `auto`."""
@@ -231,26 +230,37 @@ class ThreadedStream:
         """Switch effects on or off; None leaves one to the server's plan."""
         self.run_later(lambda: self._stream.set_effects(effects, output=output))
 
-    def run_later(self, begin: Callable[[], Coroutine[Any, Any, object]]) -> None:
-        """Have the stream's thread do something, whose result nobody waits for. After the end nothing happens."""
-        self._call_soon(lambda: self._keep(self._loop.create_task(self._quietly(begin))))
+    def run_later(self, begin: Callable[[], Coroutine[Any, Any, T]]) -> "Future[T]":
+        """Have the stream's thread do something. The future has the result, or the error if the stream has ended."""
+        later: Future[T] = Future()
+
+        def start() -> None:
+            task = self._loop.create_task(begin())
+            self._tasks.add(task)  # a task that nobody refers to could be collected while it runs
+            task.add_done_callback(lambda done: self._settle(done, later))
+
+        self._call_soon(start, later)
+        return later
 
     def offer(self, emitter: in_asyncio.Emitter, samples: Samples) -> None:
         emitter.require_live()
-        self._call_soon(lambda: emitter.offer(samples))
+        self._call_soon(lambda: emitter.offer(samples), None)
 
-    def _call_soon(self, call: Callable[[], None]) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+    def _call_soon(self, call: Callable[[], None], later: "Future[T] | None") -> None:
+        try:
             self._loop.call_soon_threadsafe(call)
+        except RuntimeError:  # the loop is closed
+            if later is not None:
+                later.set_exception(ClosedError("the stream is closed"))
 
-    def _keep(self, task: "asyncio.Task[None]") -> None:
-        """Tasks that nobody refers to could be collected while they run."""
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _quietly(self, begin: Callable[[], Coroutine[Any, Any, object]]) -> None:
-        with contextlib.suppress(NafirClientError):  # the stream has ended: `failure` says why
-            await begin()
+    def _settle(self, task: "asyncio.Task[T]", later: "Future[T]") -> None:
+        self._tasks.discard(task)
+        if task.cancelled():
+            later.cancel()
+        elif (error := task.exception()) is not None:
+            later.set_exception(error)
+        else:
+            later.set_result(task.result())
 
     async def _add(self, options: EmitterOptions) -> ThreadedEmitter:
         return ThreadedEmitter(self, await self._stream.add_emitter(**options))
