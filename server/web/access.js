@@ -6,11 +6,6 @@ let asking = null; // the promise of an answer, while the dialog is open
 
 export const key = () => sessionStorage.getItem(KEPT_AS);
 
-/** The options of a request, with the key if there is one. */
-export function authorized(options = {}, given = key()) {
-  return given === null ? options : { ...options, headers: { ...options.headers, Authorization: `Bearer ${given}` } };
-}
-
 /** Asks for another key than the one that was `refused`. Resolves when there is one; all who ask meanwhile share one dialog. */
 export function askForKey(reason, refused = key()) {
   if (key() !== refused) return Promise.resolve(); // another answer came first

@@ -6,7 +6,8 @@ import { askForKey, key } from "./access.js";
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
 import { Frontier } from "./frontier.js";
-import { PoseLedger, TurnLedger } from "./latency.js";
+import { PoseLedger, TurnLedger } from "./nafir/latency.js";
+import { WorkerStream } from "./nafir/worker_stream.js";
 import { Heads } from "./heads.js";
 import { Legend } from "./legend.js";
 import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
@@ -58,7 +59,7 @@ class Page {
     this.reverberationLedger = new PoseLedger();
     this.turnLedger = new TurnLedger();
     this.turnedAt = 0;
-    this.worker = new Worker(new URL("stream_worker.js", import.meta.url), { type: "module" });
+    this.stream = new WorkerStream();
     this.connection = "idle";
     this.playing = false;
     this.steady = false;
@@ -228,6 +229,7 @@ class Page {
         this.rendered = detail;
         this.effects.show(detail);
       },
+      failed: (message) => this.notices.show("stream", message),
       refused: ({ code, message }) => {
         this.notices.show(code, message);
         // A restarted server may offer other scenes, clips and heads.
@@ -235,8 +237,7 @@ class Page {
         if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.#showLevels(frontier), () => {});
       },
     };
-    this.worker.onmessage = ({ data: { type, detail } }) => handlers[type](detail);
-    this.worker.onerror = (event) => this.notices.show("stream", event.message || "The stream could not be started.");
+    for (const [type, handle] of Object.entries(handlers)) this.stream.addEventListener(type, ({ detail }) => handle(detail));
   }
 
   #listenToControls() {
@@ -354,7 +355,7 @@ class Page {
   }
 
   #tell(type, detail, transfer = []) {
-    this.worker.postMessage({ type, detail }, transfer);
+    this.stream.tell(type, detail, transfer);
   }
 
   get #wantedOutput() {

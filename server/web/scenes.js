@@ -1,37 +1,22 @@
-// Requests to the server over HTTP: scenes, clips, heads and loudness maps. Problem documents become RequestError.
+// Requests to the server over HTTP: scenes, clips, heads and loudness maps. A server that asks for a key gets the one
+// that the user gives.
 
-import { askForKey, authorized, key } from "./access.js";
+import { askForKey, key } from "./access.js";
+import { decoderUrl, fetchJson } from "./nafir/http.js";
 
-const endpoint = (path) => new URL(`v1/${path}`, document.baseURI);
+const BASE = new URL("v1/", document.baseURI);
+const endpoint = (path) => new URL(path, BASE);
 const NEEDS_KEY = 401;
-
-export class RequestError extends Error {
-  constructor(message, { code = "unreachable", status = 0 } = {}) {
-    super(message);
-    this.code = code;
-    this.status = status;
-  }
-}
 
 async function getJson(url, options) {
   const given = key();
-  let response;
   try {
-    response = await fetch(url, authorized(options, given));
+    return await fetchJson(url, { ...options, key: given });
   } catch (error) {
-    if (error.name === "AbortError") throw error;
-    throw new RequestError("The server cannot be reached.");
-  }
-  if (response.ok) return response.json();
-  const problem = await response.json().catch(() => ({}));
-  if (response.status === NEEDS_KEY) {
-    await askForKey(problem.detail, given);
+    if (error.status !== NEEDS_KEY) throw error;
+    await askForKey(error.message, given);
     return getJson(url, options);
   }
-  throw new RequestError(problem.detail || problem.title || `The server answered ${response.status}.`, {
-    code: problem.code,
-    status: response.status,
-  });
 }
 
 export const fetchScenes = () => getJson(endpoint("scenes"));
@@ -41,11 +26,7 @@ export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;
 export const fetchHeads = () => getJson(endpoint("hrtfs"));
 
 /** The filters by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. */
-export function fetchDecoder(head, { order, sampleRate }) {
-  const url = endpoint(`hrtfs/${encodeURIComponent(head)}/decoder`);
-  for (const [key, value] of Object.entries({ order, sample_rate: sampleRate })) url.searchParams.set(key, value);
-  return getJson(url);
-}
+export const fetchDecoder = (head, wanted) => getJson(decoderUrl(BASE, head, wanted));
 
 export function fetchLoudness(scene, { position, heightM, signal }) {
   const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);

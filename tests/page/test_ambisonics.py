@@ -20,12 +20,12 @@ QUANTA = 12
 RATE = 24_000
 
 ROTATE = """async ({ orientations, order }) => {
-  const { rotation } = await import(new URL("ambisonics.js", document.baseURI));
+  const { rotation } = await import(new URL("nafir/ambisonics.js", document.baseURI));
   return orientations.map((orientation) => Array.from(rotation(orientation, order)));
 }"""
 
 DECODE = """async ({ order, channels, heads, turns }) => {
-  const { HeadDecoder } = await import(new URL("ambisonics.js", document.baseURI));
+  const { HeadDecoder } = await import(new URL("nafir/ambisonics.js", document.baseURI));
   const floats = (text) => new Float32Array(Uint8Array.from(atob(text), (char) => char.charCodeAt(0)).buffer);
   const sound = channels.map(floats);
   const decoder = new HeadDecoder({ order, frames: 128 });
@@ -155,7 +155,7 @@ def test_without_filters_two_cardioids_hear(page, order):
 
 
 WIRE = """async ({ count, frames }) => {
-  const { parseBlock } = await import(new URL("wire.js", document.baseURI));
+  const { parseBlock } = await import(new URL("nafir/wire.js", document.baseURI));
   const buffer = new ArrayBuffer(28 + 4 * count * frames);
   const view = new DataView(buffer);
   view.setUint8(0, 1);

@@ -15,7 +15,7 @@ pytestmark = visitor.needs_browser
 
 
 SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0 }) => {
-  const { JitterBuffer } = await import(new URL("jitterbuffer.js", document.baseURI));
+  const { JitterBuffer } = await import(new URL("nafir/jitterbuffer.js", document.baseURI));
   const rate = 24_000;
   const buffer = new JitterBuffer({ sampleRate: rate });
   const tone = (n) => 0.5 * Math.sin((2 * Math.PI * 220 * n) / rate);
@@ -135,7 +135,7 @@ def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(one_page):
 
 
 RESTART = """async () => {
-  const { JitterBuffer } = await import(new URL("jitterbuffer.js", document.baseURI));
+  const { JitterBuffer } = await import(new URL("nafir/jitterbuffer.js", document.baseURI));
   const buffer = new JitterBuffer({ sampleRate: 24_000 });
   const samples = (value) => new Float32Array(24_000).fill(value);
   const played = [];

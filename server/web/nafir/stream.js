@@ -1,7 +1,7 @@
 // A live stream that reconnects by itself. It keeps the wanted state (poses, emitters) and sends it to the server at first and after
 // every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
-import { authorized } from "./access.js";
+import { authorized } from "./http.js";
 import { FLAG_LATE, PROTOCOL, isBlock, message, parseBlock, serializePose } from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent

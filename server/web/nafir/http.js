@@ -1,0 +1,39 @@
+// Requests to a server over HTTP. Problem documents become RequestError.
+
+export class RequestError extends Error {
+  constructor(message, { code = "unreachable", status = 0 } = {}) {
+    super(message);
+    this.code = code;
+    this.status = status;
+  }
+}
+
+/** The options of a request, with a key if there is one. */
+export function authorized(options = {}, key = null) {
+  return key === null ? options : { ...options, headers: { ...options.headers, Authorization: `Bearer ${key}` } };
+}
+
+/** What the server says at `url`. Throws RequestError if it refuses or cannot be reached, and AbortError if `options.signal` says so. */
+export async function fetchJson(url, { key = null, ...options } = {}) {
+  let response;
+  try {
+    response = await fetch(url, authorized(options, key));
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new RequestError("The server cannot be reached.");
+  }
+  if (response.ok) return response.json();
+  const problem = await response.json().catch(() => ({}));
+  throw new RequestError(problem.detail || problem.title || `The server answered ${response.status}.`, {
+    code: problem.code,
+    status: response.status,
+  });
+}
+
+/** Where the filters are by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. `base` is the
+    address of v1/. */
+export function decoderUrl(base, head, { order, sampleRate }) {
+  const url = new URL(`hrtfs/${encodeURIComponent(head)}/decoder`, base);
+  for (const [name, value] of Object.entries({ order, sample_rate: sampleRate })) url.searchParams.set(name, value);
+  return url;
+}
