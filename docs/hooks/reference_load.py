@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from reference_text import attribute_docstrings, code, number, sentence, table
+from reference_text import code, number, sentence, table
+from server.core.docstrings import attribute_docstrings
 from server.streaming.headroom import LIMITS, Limits
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 

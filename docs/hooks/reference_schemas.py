@@ -5,8 +5,9 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from reference_text import attribute_docstrings, code, default_text, number, paragraphs, sentence, table
+from reference_text import code, default_text, number, paragraphs, sentence, table
 from server.api.settings import Settings
+from server.core.docstrings import attribute_docstrings
 from server.scene import geometry
 from server.scene import manifest as manifests
 

@@ -47,6 +47,7 @@ def _rule(path: str, *scopes: api_keys.Scope, methods: frozenset[str] | None = N
 RULES: Final = (
     _rule(r"/v1/scenes(/[^/]+(/frontier)?)?", "listen", "render", methods=_READ),
     _rule(r"/v1/scenes/[^/]+/[^/]+", "render"),
+    _rule(r"/v1/scenes/[^/]+/bundle/[^/]+", "render", methods=_READ),
     _rule(r"/v1/clips(/.*)?", "listen", "upload", methods=_READ),
     _rule(r"/v1/clips(/.*)?", "upload"),
     _rule(r"/v1/hrtfs(/.*)?", "listen", "render", methods=_READ),

@@ -28,6 +28,7 @@ _TYPES: Final = frozenset(
         "application/javascript",
         "application/json",
         "application/problem+json",
+        "application/schema+json",
         "image/svg+xml",
         "text/css",
         "text/html",

@@ -8,6 +8,7 @@ from fastapi.openapi.utils import get_openapi
 from server.api.access_gate import scopes_for
 from server.api.api_keys import SCOPES
 from server.api.connection_limits import HEALTH_PATHS
+from server.api.openapi_examples import answer_examples, parameter_example
 from server.api.problem_codes import PROBLEM_CODES
 from server.responses.response_batch import ResponseBatch
 
@@ -33,6 +34,14 @@ _OF_A_COMPUTATION: Final = {
 }
 _PROBLEM: Final[Object] = {
     "description": "A problem document (RFC 9457). `code` is for programs and does not change, `field` is at fault.",
+    "example": {
+        "type": "about:blank",
+        "title": "Not Found",
+        "status": 404,
+        "detail": "there is no scene 'moon'",
+        "code": "unknown_scene",
+        "field": "scene",
+    },
     "type": "object",
     "required": ["type", "title", "status", "detail", "code", "field"],
     "properties": {
@@ -49,7 +58,10 @@ _PROBLEM: Final[Object] = {
 }
 _OF_A_BODY: Final = {"415": "The body is not JSON."}
 _COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/plan")
-_TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder")
+_TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder", "/bundle/{file}")
+_RANGED: Final = "/bundle/{file}"
+_OF_A_RANGE: Final = {"416": "The file ends before the range that is asked for."}
+_PART: Final = {"206": {"description": "The part that `Range` asks for."}}
 
 
 _NO_KEY: Final[Object] = {
@@ -93,9 +105,22 @@ def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
                 operation["security"] = [{"key": [scope]} for scope in SCOPES if scope in needed]
             for parameter in operation.get("parameters", ()):
                 parameter["schema"] = _without_null(parameter["schema"])
+                example = parameter_example(parameter["name"], parameter["schema"])
+                # Swagger UI fills in every `example`, and some optional parameters contradict each other.
+                if example is None:
+                    continue
+                if parameter.get("required"):
+                    parameter["example"] = example
+                else:
+                    parameter["schema"]["examples"] = [example]
             operation["responses"] |= _refusals(path, has_body="requestBody" in operation)
             if "security" in operation:
                 operation["responses"] |= _described(_NO_KEY)
+            for kind, content in operation["responses"]["200"].get("content", {}).items():
+                if kind == "application/json" and path in answer_examples():
+                    content["example"] = answer_examples()[path]
+            if path.endswith(_RANGED):
+                operation["responses"] |= _PART
             if path.endswith(_TAGGED):
                 operation["responses"]["304"] = {"description": "The client has it already, by its `If-None-Match`."}
     return document
@@ -111,6 +136,8 @@ def _refusals(path: str, *, has_body: bool) -> Object:
         refused |= _OF_A_HEAD
     if path.endswith(_COMPUTED):
         refused |= _OF_A_COMPUTATION
+    if path.endswith(_RANGED):
+        refused |= _OF_A_RANGE
     responses = _described(refused)
     responses["503"] |= {"headers": {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}}
     return responses

@@ -17,6 +17,7 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 from server.api.compression import accepts_gzip
+from server.api.ranged_files import RangedFile
 
 _ALLOW = {"Allow": "GET, HEAD, OPTIONS"}
 _COMPRESSED = ".gz"
@@ -48,9 +49,9 @@ class PageFiles(StaticFiles):
     ) -> Response:
         tag = _tag(Path(full_path), stat_result.st_mtime_ns, stat_result.st_size)
         if not full_path.endswith(_COMPRESSED):
-            response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
+            response: Response = RangedFile(full_path, status_code, stat_result=stat_result)
         elif accepts_gzip(Headers(scope=scope)):
-            response = super().file_response(full_path, stat_result, _unconditional(scope), status_code)
+            response = RangedFile(full_path, status_code, stat_result=stat_result)
             response.headers["Content-Encoding"] = "gzip"
             response.headers["Vary"] = "Accept-Encoding"
         else:
@@ -63,11 +64,6 @@ class PageFiles(StaticFiles):
         if response.headers["ETag"] in {tag.strip().removeprefix("W/") for tag in had.split(",")}:
             return NotModifiedResponse(response.headers)
         return response
-
-
-def _unconditional(scope: Scope) -> Scope:
-    conditions = {b"if-none-match", b"if-modified-since"}
-    return {**scope, "headers": [each for each in scope["headers"] if each[0].lower() not in conditions]}
 
 
 @lru_cache(maxsize=1024)

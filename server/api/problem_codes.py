@@ -6,6 +6,7 @@ from typing import Final
 PROBLEM_CODES: Final[Mapping[str, str]] = {
     "answer_too_long": "409: so many responses of this scene and output are more than the server sends at once",
     "body_too_large": "413: the body is longer than the server takes",
+    "bundle_not_offered": "403: the server does not give its scene bundles away",
     "contradicting_parameters": "409: two parameters contradict each other; leave one out",
     "doubled_effect": "409: the query switches one effect twice",
     "doubled_header": "400: `Host`, `Origin`, `Sec-Fetch-Site` or a key is given several times",
@@ -32,6 +33,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "origin_not_allowed": "403: pages of this site may not use the server; an operator can allow it",
     "position_out_of_bounds": "404: the position is outside the scene or inside a wall",
     "preflight_refused": "400: pages of this site may not send such a request; the detail says what they may",
+    "range_not_satisfiable": "416: the file ends before the range that is asked for",
     "request_line_too_long": "414: the URL is longer than the server takes",
     "request_timeout": "408: the request did not arrive whole in time",
     "scope_missing": "403: the key is valid and not for this; the detail names the scope",
@@ -43,6 +45,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "too_many_headers": "431: the request has more headers than the server takes",
     "too_many_poses": "422: more impulse responses are asked for than one request may; send several",
     "unknown_effect": "422: there is no effect of this name; the message lists those there are",
+    "unknown_file": "404: the scene's bundle has no file of this name",
     "unknown_format": "422: the answer cannot be written in this format",
     "unknown_hrtf": "404: there is no such head; `GET /v1/hrtfs` lists them",
     "unknown_level": "404: the scene has no quality level of this name",

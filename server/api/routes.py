@@ -3,11 +3,11 @@
 import json
 from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Query, Request, Response, WebSocket
+from fastapi import APIRouter, Path, Query, Request, Response, WebSocket
 from fastapi.responses import StreamingResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BeforeValidator, Field
@@ -17,10 +17,12 @@ from starlette.types import Receive, Scope, Send
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.api.access_gate import caller_of
 from server.api.asyncapi import document
+from server.api.bundle_files import BundleFiles
 from server.api.catalogue import describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
 from server.api.process_peers import OWN_METRICS
+from server.api.ranged_files import RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
@@ -49,6 +51,8 @@ from server.responses.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_
 from server.responses.response_batch import BATCH_EXAMPLE, BATCH_MEDIA_TYPES, ResponseBatch
 from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
+from server.scene.bundle import Bundle
+from server.scene.manifest_schema import manifest_schema
 
 MAX_MAP_SPACING_M = 20.0
 MAX_MAP_S = 120.0
@@ -74,7 +78,8 @@ _TURNS = _between(-36_000, 36_000)
 Number = Annotated[float, BeforeValidator(lambda value: parse_decimal(value) if isinstance(value, str) else value)]
 WholeNumber = Annotated[int, BeforeValidator(lambda value: parse_integer(value) if isinstance(value, str) else value)]
 LevelText = Annotated[str | None, Query(description="quality level; by default the scene's first")]
-PositionText = Annotated[str, Query(description="x,y,z in metres", examples=["1,2,1.5"], json_schema_extra=_PLACE)]
+ScenePath = Annotated[str, Path(description="id of a scene")]
+PositionText = Annotated[str, Query(description="x,y,z in metres", json_schema_extra=_PLACE)]
 YawDeg = Annotated[Number, Query(**_TURNS, description="of the head, counter-clockwise, 0 looks along +x")]
 EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
@@ -90,6 +95,9 @@ _BATCH_BODY = {
         },
     },
 }
+_FILE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
+_FILE_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_SCHEMA_TYPES: dict[str, Any] = {"content": {"application/schema+json": {"schema": {"type": "object"}}}}
 _MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 _MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
@@ -144,13 +152,13 @@ async def scenes(request: Request) -> dict[str, Any]:
 
 
 @api.get("/scenes/{scene}")
-async def one_scene(request: Request, scene: str) -> dict[str, Any]:
+async def one_scene(request: Request, scene: ScenePath) -> dict[str, Any]:
     """One scene, as in the list of all."""
     return describe_scene(_levels(request, scene)).model_dump()
 
 
 @api.get("/scenes/{scene}/frontier")
-async def frontier(request: Request, scene: str) -> Frontier:
+async def frontier(request: Request, scene: ScenePath) -> Frontier:
     """Accuracy and cost of each quality level."""
     levels, offer = _levels(request, scene), _host(request).offers.get(scene)
     return Frontier.of(levels, {} if offer is None else offer.ms_here)
@@ -159,7 +167,7 @@ async def frontier(request: Request, scene: str) -> Frontier:
 @api.get("/scenes/{scene}/impulse-response", response_class=Response, responses={200: _IR_TYPES})
 async def impulse_response(
     request: Request,
-    scene: str,
+    scene: ScenePath,
     listener: PositionText,
     emitter: PositionText,
     yaw_deg: YawDeg = 0.0,
@@ -169,7 +177,6 @@ async def impulse_response(
         str | None,
         Query(
             description="x,y,z,w: a quaternion of the head, of any length but zero, in place of the three angles",
-            examples=["0,0,0.707,0.707"],
             json_schema_extra={"pattern": ORIENTATION_PATTERN},
         ),
     ] = None,
@@ -220,7 +227,7 @@ async def impulse_response(
     responses={200: _BATCH_TYPES},
     openapi_extra={"requestBody": _BATCH_BODY},
 )
-async def impulse_responses(request: Request, scene: str) -> Response:
+async def impulse_responses(request: Request, scene: ScenePath) -> Response:
     """Impulse responses between many pairs of places, the same as single ones, in one file. It is sent while it is
     computed: a connection that ends before the file does says that something failed."""
     levels, host = _levels(request, scene), _host(request)
@@ -251,7 +258,7 @@ async def impulse_responses(request: Request, scene: str) -> Response:
 @api.get("/scenes/{scene}/loudness", response_class=Response, responses={200: _MAP_TYPES})
 async def loudness(
     request: Request,
-    scene: str,
+    scene: ScenePath,
     emitter: PositionText,
     height_m: Annotated[Number, Query(**_between(-1_000, 1_000), description="of the listener's ears")] = 1.5,
     spacing_m: Annotated[
@@ -298,7 +305,7 @@ async def loudness(
 @api.get("/scenes/{scene}/plan", response_model=PlanDocument)
 async def plan(
     request: Request,
-    scene: str,
+    scene: ScenePath,
     listener: Annotated[
         str | None, Query(description="x,y,z in metres; by default where a visitor starts", json_schema_extra=_PLACE)
     ] = None,
@@ -349,6 +356,48 @@ async def plan(
     return Response(body, media_type="application/json", headers=headers)
 
 
+@api.get("/scenes/{scene}/bundle")
+def bundle(request: Request, scene: ScenePath) -> BundleFiles:
+    """The files of a scene's bundle, for programs that compute responses themselves."""
+    return BundleFiles.of(_offered_bundle(request, scene))
+
+
+@api.get("/scenes/{scene}/bundle/{file}", response_class=Response, responses={200: _FILE_TYPES})
+async def bundle_file(
+    request: Request, scene: ScenePath, file: Annotated[str, Path(description="its name")]
+) -> Response:
+    """A file of a scene's bundle, or a part of it (`Range`)."""
+    offered = _offered_bundle(request, scene)
+    if (digest := BundleFiles.digests(offered).get(file)) is None:
+        problem = f"the bundle has no file {file[:80]!r}; GET /v1/scenes/{scene}/bundle lists them"
+        raise RequestError("unknown_file", problem, field="file", status=404)
+    headers = {"ETag": f'"{digest[:32]}"', "Cache-Control": CACHE_CONTROL}
+    if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    media_type = "application/json" if file.endswith(".json") else "application/octet-stream"
+    path = offered.folder / file
+    stat_result = await anyio.to_thread.run_sync(path.stat)
+    return RangedFile(path, headers=headers, media_type=media_type, stat_result=stat_result)
+
+
+def _offered_bundle(request: Request, scene: str) -> Bundle:
+    found = _levels(request, scene).bundle
+    if not _host(request).settings.offer_bundles:
+        raise RequestError("bundle_not_offered", "this server does not give its scene bundles away", status=403)
+    return found
+
+
+@api.get("/schemas/bundle", response_class=Response, responses={200: _SCHEMA_TYPES})
+def bundle_schema() -> Response:
+    """JSON schema (draft 2020-12) of `scene.json`, the manifest of a scene bundle."""
+    return Response(_schema_text(), media_type="application/schema+json", headers={"Cache-Control": CACHE_CONTROL})
+
+
+@cache
+def _schema_text() -> bytes:
+    return json.dumps(manifest_schema()).encode()
+
+
 @api.get("/clips")
 async def clips(request: Request) -> dict[str, Any]:
     """Clips that emitters can play."""
@@ -369,8 +418,8 @@ async def hrtfs(request: Request) -> dict[str, Any]:
 @api.get("/hrtfs/{hrtf}/decoder", response_class=Response, responses={200: _DECODER_TYPES})
 async def decoder(
     request: Request,
-    hrtf: str,
-    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that streams have", examples=[48_000])],
+    hrtf: Annotated[str, Path(description="name of a head")],
+    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that streams have")],
     order: Annotated[
         WholeNumber, Query(**_between(ORDERS[0], ORDERS[-1]), description="of the ambisonic channels")
     ] = ORDERS[0],

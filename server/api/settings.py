@@ -99,6 +99,8 @@ class Settings(BaseSettings):
     """Whether the server has a page. Its files need no key."""
     bundles: Paths = ()
     """Scene bundles to serve besides those that come with the package."""
+    offer_bundles: bool = True
+    """Whether clients may read the files of scene bundles, trained fields included, to compute responses themselves."""
     clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, besides those that come with the package."""
     hrtfs: NamedFiles = ()

@@ -284,6 +284,14 @@ def irs(
 
 
 @app.command()
+def bundle_schema() -> None:
+    """Print the JSON schema of scene.json, the manifest of a scene bundle."""
+    from server.scene.manifest_schema import manifest_schema
+
+    typer.echo(json.dumps(manifest_schema(), indent=2))
+
+
+@app.command()
 def render(
     scene: Scene,
     emitter: Annotated[

@@ -11,11 +11,18 @@ of `bounds`.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
@@ -188,6 +195,11 @@ class Accuracy(Strict):
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
+def _without_filled(schema: dict[str, Any]) -> None:
+    """Say in the schema of `Cost` that what is filled in may be missing."""
+    schema["required"] = [name for name in schema["required"] if name not in {"ms_mean", "ms_miss"}]
+
+
 class Cost(Strict):
     """Time on one core of `host` from a pose until its binaural response is ready to be convolved.
 
@@ -198,6 +210,8 @@ class Cost(Strict):
     per emitter of four. `ms_turn` and `block_us` are absent if they were not measured. `storage_mb` is the size of the
     field's file, `memory_mb` the memory that serving it adds to a process.
     """
+
+    model_config = ConfigDict(json_schema_extra=_without_filled)
 
     ms_p50: Positive
     ms_p99: Positive

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import io
 import json
 import re
@@ -17,6 +18,7 @@ from starlette.testclient import TestClient
 
 from server.api import app
 from server.api.app import create_app
+from server.api.openapi_examples import answer_examples
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
 from server.core.errors import FieldError
@@ -26,6 +28,8 @@ from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf, kemar
 from server.responses.impulse_response import MEDIA_TYPES, ImpulseResponse, IrQuery
 from server.responses.response_batch import BATCH_FORMATS, BATCH_MEDIA_TYPES
+from server.scene.bundle import Bundle
+from server.scene.manifest_schema import manifest_schema
 from tests.directional_flat import write_directional
 from tests.killing import kill, threads_may_die
 
@@ -266,6 +270,73 @@ def test_a_batch_whose_first_response_fails_is_a_problem_and_later_ones_cut_the_
     assert np.load(io.BytesIO(client.post(BATCH, json=request).content))["responses"].shape[0] == 2
 
 
+def test_a_bundle_can_be_read_back_file_by_file(shared_client, bundle, tmp_path):
+    listed = shared_client.get("/v1/scenes/flat/bundle").json()
+    assert (listed["scene"], listed["files"][0]["name"]) == ("flat", "scene.json")
+    for each in listed["files"]:
+        answer = shared_client.get(f"/v1/scenes/flat/bundle/{each['name']}", headers={"Accept-Encoding": "identity"})
+        assert len(answer.content) == each["bytes"]
+        assert hashlib.sha256(answer.content).hexdigest() == each["sha256"]
+        (tmp_path / each["name"]).write_bytes(answer.content)
+    assert Bundle.load(tmp_path).digest == bundle.digest
+
+
+def test_a_file_of_a_bundle_is_sent_once_and_in_parts(shared_client, bundle):
+    path = "/v1/scenes/flat/bundle/arithmetic.onnx"
+    answer = shared_client.get(path)
+    assert shared_client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    part = shared_client.get(path, headers={"Range": "bytes=5-9", "If-Range": answer.headers["etag"]})
+    assert (part.status_code, part.content) == (206, bundle.models["arithmetic.onnx"][5:10])
+    check_problem(shared_client.get(path, headers={"Range": "bytes=99999999-"}), 416, "range_not_satisfiable", "Range")
+    for name in ("scene.jso", "..%2Fscene.json", "%2Fetc%2Fpasswd"):
+        assert shared_client.get(f"/v1/scenes/flat/bundle/{name}").status_code == 404
+    check_problem(shared_client.get("/v1/scenes/flat/bundle/a.onnx"), 404, "unknown_file", "file")
+
+
+def test_bundles_are_kept_where_an_operator_says_so(field, hrtfs):
+    settings = Settings(offer_bundles=False)
+    with TestClient(create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
+        for path in ("bundle", "bundle/scene.json"):
+            check_problem(client.get(f"/v1/scenes/flat/{path}"), 403, "bundle_not_offered")
+
+
+def test_the_schema_of_bundles_is_published(shared_client):
+    answer = shared_client.get("/v1/schemas/bundle")
+    assert answer.headers["content-type"] == "application/schema+json"
+    assert answer.json() == manifest_schema()
+
+
+@pytest.mark.parametrize("path", answer_examples())
+def test_examples_of_answers_have_what_answers_have(shared_client, path):
+    """Of the same keys, at every depth: items of lists are compared by their first."""
+
+    def keys(value):
+        if isinstance(value, dict):
+            return {name: keys(inside) for name, inside in value.items()}
+        return [keys(value[0])] if isinstance(value, list | tuple) and value else None
+
+    params = {"listener": PLACES["listener"], "emitter": PLACES["emitter"], "format": "json", "sample_rate": 24_000}
+    operation = shared_client.get("/openapi.json").json()["paths"][path]["get"]
+    wanted = {each["name"] for each in operation.get("parameters", ()) if each.get("in") == "query"}
+    asked = path.replace("{scene}", "flat").replace("{hrtf}", "kemar")
+    answer = shared_client.get(asked, params={name: text for name, text in params.items() if name in wanted}).json()
+    example = operation["responses"]["200"]["content"]["application/json"]["example"]
+    assert example == json.loads(json.dumps(answer_examples()[path]))
+    assert set(example) == set(answer)
+    if path not in {"/v1/scenes", "/v1/scenes/{scene}", "/v1/scenes/{scene}/frontier"}:  # a level has what it has
+        assert keys(example) == keys(answer)
+
+
+def test_every_parameter_and_json_answer_has_an_example(shared_client):
+    for path, operations in shared_client.get("/openapi.json").json()["paths"].items():
+        for operation in operations.values():
+            for each in operation.get("parameters", ()):
+                assert "example" in each or "examples" in each["schema"], (path, each["name"])
+            content = operation["responses"]["200"]["content"]
+            if path != "/v1/scenes/{scene}/bundle/{file}":
+                assert "example" in content.get("application/json", {"example": ""}), path
+
+
 def test_another_head_has_another_response_and_tag(directional_client):
     usual, small = (
         directional_client.get(IR, params={**PLACES, "hrtf": hrtf, "format": "npy"}) for hrtf in ("kemar", "small")
@@ -299,7 +370,8 @@ def test_what_a_client_has_is_not_sent_again(client, field):
     field.impulse_responses = None
     for header in (tag, f"W/{tag}", f'"other", {tag}', "*"):
         again = client.get(IR, params=PLACES, headers={"If-None-Match": header})
-        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        expected = header if header.startswith("W/") else tag
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", expected)
         assert again.headers["cache-control"] == first.headers["cache-control"]
     assert client.get(IR, params=PLACES, headers={"If-None-Match": '"other"'}).content == first.content
 

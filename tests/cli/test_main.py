@@ -29,6 +29,7 @@ from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel
+from server.scene.manifest_schema import manifest_schema
 from tests.directional_flat import write_directional
 
 NAFIR = [sys.executable, "-c", "from server.cli.main import main; main()"]
@@ -150,6 +151,12 @@ def test_irs_that_cannot_be_written_are_refused(nafir, bundle, poses, tmp_path):
     far = POSES["poses"][0] | {"emitter": [99, 0, 0]}
     check_error(nafir("irs", bundle.folder, poses(poses=[far]), "-o", output), "poses[0]", "emitter")
     assert not output.exists()
+
+
+def test_bundle_schema_prints_the_schema(nafir):
+    code, said, _ = nafir("bundle-schema")
+    assert code == 0
+    assert json.loads(said) == manifest_schema()
 
 
 @pytest.fixture
