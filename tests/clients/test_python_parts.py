@@ -10,7 +10,8 @@ from nafir_client import Backoff, ProtocolError, RefusedError, UnreachableError
 from nafir_client.address import api_url, stream_url
 from nafir_client.ambisonics import Ears, harmonics, rotation
 from nafir_client.live_input import LiveInput
-from nafir_client.outbox import Outbox
+from nafir_client.outbox import Outbox, Outgoing
+from nafir_client.pose import Pose
 from nafir_client.recording import Recording
 from nafir_client.session import Session
 from nafir_client.stream_statistics import PoseWaits
@@ -31,7 +32,7 @@ def drained(outbox):
 def test_newer_poses_take_the_place_of_older_ones_and_keep_their_order():
     outbox = Outbox()
     for message, key in [("l1", "l"), ("a", None), ("e2", "e"), ("l3", "l"), ("b", None), ("e4", "e")]:
-        outbox.put(message, key)
+        outbox.put(Outgoing(message), key)
     assert drained(outbox) == ["a", "l3", "b", "e4"]
 
 
@@ -159,7 +160,7 @@ def test_the_clock_goes_on_over_connections_by_the_time_between_them(session):
     for number in range(100):
         session.receive(wire_block(number, 256 * number), 5.0)
     session.disconnect()
-    session.hello()
+    session.first_message()
     session.greet(WELCOME, 7.0)  # two seconds later, of which 8 blocks still waited to be played
     first = session.receive(wire_block(0, 0), 7.1)
     away = first.sample_clock - 25_600
@@ -173,9 +174,87 @@ def test_the_clock_goes_on_over_connections_by_the_time_between_them(session):
 
 def test_a_connection_that_is_back_at_once_continues_where_the_last_one_ended(session):
     session.receive(wire_block(0, 0), 5.0)
-    session.hello()
+    session.first_message()
     session.greet(WELCOME, 5.01)
     assert session.receive(wire_block(0, 0), 5.02).sample_clock == 256
+
+
+def resumable(**resumed):
+    """A welcome with a token, of a stream that goes on if it has more fields."""
+    welcome = {**json.loads(WELCOME), "resume_token": "t1", "resume_s": 30}
+    return json.dumps(welcome | ({"resumed": resumed} if resumed else {}))
+
+
+def test_a_stream_is_resumed_with_what_the_server_has_not_got():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    talker = session.add_emitter({"id": "talker", "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
+    session.set_level("a")
+    session.move_listener(Pose.of((1, 1, 1)), 0.0)
+    session.move_emitter(talker, (2.0, 2.0, 1.0), None, 0.0)
+    session.set_level("b")
+    session.ping(0.0)
+    drained(session.outbox)
+    session.set_level("c")  # which was never sent
+    for number in range(3):
+        session.receive(wire_block(number, 256 * number), 1.0)
+    session.disconnect()
+    first = json.loads(session.first_message())
+    assert first == {"type": "resume", "protocol": 3, "token": "t1", "sequence": 2, "sample_clock": 512}
+    # It has the emitter and level a, and the listener's pose, but not the emitter's.
+    session.greet(resumable(sample_clock=768, sequence=3, pose_id=1, handled=2), 9.0)
+    sent = [json.loads(message) for message in drained(session.outbox) if isinstance(message, str)]
+    assert [(each["type"], each.get("level")) for each in sent] == [
+        ("set_level", "b"),
+        ("set_level", "c"),
+        ("move_emitter", None),
+    ]
+    assert (sent[-1]["pose_id"], sent[-1]["position"]) == (3, [2.0, 2.0, 1.0])
+    block = session.receive(wire_block(3, 768), 9.1)
+    assert (block.sample_clock, session.statistics.blocks_skipped) == (768, 0)
+
+
+def test_messages_that_are_lost_twice_are_sent_twice():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    for level in "abc":
+        session.set_level(level)
+    drained(session.outbox)
+    for handled in (1, 2):
+        session.first_message()
+        session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=handled), 0.0)
+        assert [json.loads(each)["level"] for each in drained(session.outbox)] == list("abc"[handled:])
+
+
+def test_where_no_stream_is_kept_a_hello_begins_anew():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.add_emitter({"id": "talker", "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
+    drained(session.outbox)
+    assert json.loads(session.first_message())["type"] == "resume"
+    with pytest.raises(RefusedError) as refused:
+        session.greet('{"type": "error", "code": "unknown_resume_token", "message": "no"}', 0.0)
+    assert refused.value.is_passing
+    assert json.loads(session.first_message())["type"] == "hello"
+    session.greet(resumable(), 0.0)
+    assert [json.loads(each)["type"] for each in drained(session.outbox)] == ["add_emitter"]
+
+
+def test_a_new_stream_plays_no_clip_again_that_plays_once():
+    session = Session("flat", {})
+    session.greet(WELCOME, 0.0)
+    for name, loop in [("once", False), ("waiting", False), ("loop", True)]:
+        session.add_emitter({"id": name, "clip": "noise", "loop": loop, "position": (1.0, 2.0, 1.0)}, None)
+    for name in ("once", "loop"):
+        session.receive(f'{{"type": "emitter_added", "id": "{name}", "sample_clock": 0}}', 0.0)
+    once = session.emitters["once"]
+    session.first_message()
+    session.greet(WELCOME, 1.0)
+    assert [json.loads(each)["id"] for each in drained(session.outbox)] == ["waiting", "loop"]
+    assert once.has_ended
 
 
 def test_messages_and_blocks_of_a_newer_server_are_ignored(session):

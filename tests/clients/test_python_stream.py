@@ -9,6 +9,10 @@ import pytest
 
 import nafir_client
 from nafir_client import Backoff, ConnectionLostError, RefusedError, UnreachableError
+from server.api.api_keys import create_key, revoke_key
+from server.field.fields_by_level import FieldsByLevel
+from server.protocol.codes import ACCESS_ENDED
+from tests.serving import serving
 
 SOON = Backoff(first_s=0.02, longest_s=0.1)
 
@@ -65,6 +69,41 @@ def test_what_is_written_to_a_live_emitter_comes_back(served, encoding):
     before, after, dropped = running(perform())
     assert (loudness(before), dropped) == (0, 0)
     assert loudness(after) > 1e-3
+
+
+def test_a_stream_has_the_rate_that_it_asks_for(served):
+    async def listen():
+        async with connect(served, sample_rate=48_000, block_size=512) as stream:
+            live = await stream.add_emitter()
+            await live.write(np.random.default_rng(1).standard_normal(4_800).astype(np.float32) / 10)
+            return stream.sample_rate, await blocks_of(stream, 40)
+
+    rate, blocks = running(listen())
+    assert rate == 48_000
+    assert loudness(blocks) > 1e-3
+
+
+def test_a_server_that_asks_for_a_key_lets_in_whoever_has_it(bundle, hrtfs, tmp_path, monkeypatch):
+    key, entry = create_key(tmp_path / "keys.json", "game", ["listen", "render"], None)
+    monkeypatch.setenv("NAFIR_KEYS_FILE", str(tmp_path / "keys.json"))
+
+    async def listen(address, **access):
+        async with connect(address, reconnect=SOON, **access) as stream:
+            blocks = await blocks_of(stream, 5)
+            revoke_key(tmp_path / "keys.json", entry.id)
+            with pytest.raises(ConnectionLostError) as lost:
+                await blocks_of(stream, 10_000)
+            return blocks, lost.value
+
+    with serving(FieldsByLevel.load(bundle), hrtfs) as address:
+        with pytest.raises(RefusedError, match="key_required: "):
+            running(listen(address))
+        with pytest.raises(RefusedError, match="key_refused: "):
+            nafir_client.Client(f"http://{address}", api_key="nafir_000000000000_wrong").scenes()
+        assert nafir_client.Client(f"http://{address}", api_key=key).scenes()[0].id == "flat"
+        blocks, lost = running(listen(address, api_key=key))
+    assert len(blocks) == 5
+    assert (lost.close_code, lost.is_passing) == (ACCESS_ENDED, False)
 
 
 def test_what_is_refused_says_which_field_and_the_stream_goes_on(served):
@@ -150,6 +189,27 @@ def test_an_emitter_that_is_removed_is_heard_no_more_and_its_id_is_free(served):
     name, loud = running(listen())
     assert name == "voice"
     assert loud > 1e-4
+
+
+def test_a_clip_starts_and_stops_at_its_clocks_and_its_end_is_told(served):
+    async def listen():
+        async with connect(served) as stream:
+            start = 12_800
+            clip = await stream.add_emitter(
+                clip="trumpet", start_at=start, stop_at=start + 4_800, loop=False, offset_s=0.1, remove_when_ended=True
+            )
+            again = await stream.add_emitter(clip="woman-reading", gain_db=-80)
+            await again.stop(fade_s=0.02)
+            blocks = await blocks_of(stream, 120)
+            await asyncio.wait_for(clip.wait_until_ended(), 10)
+            await asyncio.wait_for(again.wait_until_ended(), 10)
+            return start, clip, blocks
+
+    start, clip, blocks = running(listen())
+    assert (clip.start_clock, clip.has_ended) == (start, True)
+    sound = np.concatenate([block.samples[:, 0] for block in blocks])
+    assert np.abs(sound[:start]).max() < 1e-4  # the other one is at -80 dB
+    assert np.abs(sound[start : start + 4_800]).max() > 1e-3
 
 
 def test_round_trips_and_late_blocks_are_counted(served):
@@ -323,6 +383,11 @@ def test_http_gives_scenes_clips_heads_and_responses(served):
     turned = client.impulse_response("flat", (2, 2.5, 1.5), (6, 3, 1.5), orientation=(0, 0, 0.5**0.5, 0.5**0.5))
     assert (response.sample_rate, len(response.samples)) == (24_000, 2)
     np.testing.assert_allclose(turned.samples, response.samples, atol=1e-6)
+    listener = nafir_client.Pose.of((2, 2.5, 1.5), yaw=np.pi / 2)
+    many = client.impulse_responses("flat", [(listener, (6, 3, 1.5)), (listener, (5, 3, 1.5))])
+    assert (many.sample_rate, many.samples.shape) == (24_000, (2, *response.samples.shape))
+    np.testing.assert_allclose(many.samples[0], response.samples, atol=1e-6)
+    assert not np.allclose(many.samples[1], response.samples, atol=1e-3)
     with pytest.raises(RefusedError) as refused:
         client.impulse_response("flat", (99, 0, 0), (6, 3, 1.5))
     assert (refused.value.code, refused.value.field) == ("position_out_of_bounds", "listener")

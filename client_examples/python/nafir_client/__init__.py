@@ -4,7 +4,7 @@
 """
 
 from nafir_client.backoff import Backoff
-from nafir_client.client import Client, ImpulseResponse
+from nafir_client.client import Client, ImpulseResponse, ImpulseResponses
 from nafir_client.errors import (
     ClipError,
     ClosedError,
@@ -34,6 +34,7 @@ __all__ = [
     "DeviceError",
     "Emitter",
     "ImpulseResponse",
+    "ImpulseResponses",
     "Message",
     "MissingExtraError",
     "NafirClientError",

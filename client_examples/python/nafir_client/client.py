@@ -6,6 +6,7 @@ import math
 import urllib.error
 import urllib.parse
 import urllib.request
+import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -15,6 +16,7 @@ import numpy as np
 from nafir_client.address import api_url
 from nafir_client.ambisonics import Matrix
 from nafir_client.errors import ProtocolError, RefusedError, UnreachableError
+from nafir_client.pose import Pose
 from nafir_client.scene import Scene
 from nafir_client.wire import Samples
 
@@ -24,6 +26,14 @@ _Query = Mapping[str, str | float | None]
 @dataclass(frozen=True)
 class ImpulseResponse:
     """A response between two places: `samples` (channel, sample)."""
+
+    samples: Samples
+    sample_rate: int
+
+
+@dataclass(frozen=True)
+class ImpulseResponses:
+    """Responses of several pairs of places: `samples` (pair, channel, sample)."""
 
     samples: Samples
     sample_rate: int
@@ -55,7 +65,7 @@ class Client:
     def head_filters(self, head: str, *, order: int, sample_rate: int) -> Matrix:
         """(ear, channel, tap) filters by which a head hears ambisonic channels."""
         query: _Query = {"order": order, "sample_rate": sample_rate, "format": "npy"}
-        return _array(self._get(f"hrtfs/{_quoted(head)}/decoder", query))
+        return np.asarray(_array(self._get(f"hrtfs/{_quoted(head)}/decoder", query)), np.float64)
 
     def impulse_response(
         self,
@@ -85,6 +95,35 @@ class Client:
         }
         samples = _array(self._get(f"scenes/{_quoted(scene)}/impulse-response", query))
         return ImpulseResponse(np.asarray(samples, np.float32), self.scene(scene).sample_rate)
+
+    def impulse_responses(
+        self,
+        scene: str,
+        pairs: Iterable[tuple[Pose, Iterable[float]]],
+        *,
+        output: Literal["binaural", "ambisonics", "mono"] | None = None,
+        order: int | None = None,
+        head: str | None = None,
+        level: str | None = None,
+    ) -> ImpulseResponses:
+        """The responses from several emitters' positions to listeners' poses, in one request."""
+        poses = [
+            {
+                "listener": listener.position,
+                "orientation": listener.orientation,
+                "emitter": [float(number) for number in emitter],
+            }
+            for listener, emitter in pairs
+        ]
+        common = {"output": output, "order": order, "hrtf": head, "level": level, "format": "npz"}
+        wish = {"poses": poses, **{name: value for name, value in common.items() if value is not None}}
+        request = urllib.request.Request(
+            f"{self._base}/scenes/{_quoted(scene)}/impulse-responses",
+            data=json.dumps(wish).encode(),
+            headers={**self._headers, "Content-Type": "application/json"},
+        )
+        arrays = _array(self._answer(request))
+        return ImpulseResponses(np.asarray(arrays["responses"], np.float32), int(arrays["sample_rate"]))
 
     def _get_json(self, path: str) -> Any:
         try:
@@ -120,12 +159,12 @@ def refused(url: str, status: int, body: bytes, retry_after: str | None) -> Unre
     return RefusedError(code, detail, field=problem.get("field"), retry_after_s=advised_s)
 
 
-def _array(data: bytes) -> Matrix:
+def _array(data: bytes) -> Any:
+    """An array, or several by their names."""
     try:
-        array: Matrix = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as exc:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, zipfile.BadZipFile) as exc:
         raise ProtocolError("the answer is no NumPy array") from exc
-    return array
 
 
 def _listed(numbers: Iterable[float]) -> str:

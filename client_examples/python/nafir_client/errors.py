@@ -1,7 +1,10 @@
 """What can go wrong between a client and its server. The text of every error fits on one line."""
 
-ACCESS_ENDED = 4401
-"""The close code for a key or token that has expired or was revoked."""
+_FINAL = frozenset({1000, 1002, 1003, 1007, 1008, 1009, 1010})
+"""Close codes after which a new connection would do no better; so are those from 4400 to 4499, as with HTTP."""
+
+
+_PASSING = frozenset({"not_ready", "server_busy", "server_draining", "unknown_resume_token"})
 
 
 class NafirClientError(Exception):
@@ -37,7 +40,7 @@ class RefusedError(NafirClientError):
     @property
     def is_passing(self) -> bool:
         """Whether the same request may succeed later: the server is busy, starting or shutting down."""
-        return self.code in {"not_ready", "server_busy", "server_draining"} or self.retry_after_s is not None
+        return self.code in _PASSING or self.retry_after_s is not None
 
 
 class UnreachableError(NafirClientError):
@@ -63,7 +66,7 @@ class ConnectionLostError(NafirClientError):
     @property
     def is_passing(self) -> bool:
         """Whether a new connection may do better: the fault was not what this client had said or done."""
-        return self.close_code not in {1000, 1002, 1003, 1007, 1008, 1009, 1010, ACCESS_ENDED}
+        return self.close_code not in _FINAL and not 4400 <= (self.close_code or 0) < 4500
 
 
 class ProtocolError(NafirClientError):

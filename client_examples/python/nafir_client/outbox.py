@@ -1,6 +1,22 @@
-"""Messages that wait to be sent, in order. Of poses and acknowledgements only the newest waits."""
+"""Messages that wait to be sent, in order. Of poses and acknowledgements only the newest waits.
 
+A server that resumes a stream says how many messages it has handled, of those that are *counted*: texts that change
+something and are not poses. They are kept after they were sent, so that the others can be sent again.
+"""
+
+from collections import deque
 from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Final
+
+_MOST_KEPT: Final = 1_000
+"""Counted messages that are kept. A server that had not handled older ones had closed the connection."""
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    data: str | bytes
+    is_counted: bool = False
 
 
 class Outbox:
@@ -8,16 +24,18 @@ class Outbox:
     goes to the end, so that pose ids rise."""
 
     def __init__(self) -> None:
-        self._waiting: dict[Hashable, str | bytes] = {}
-        self._count = 0
+        self._waiting: dict[Hashable, Outgoing] = {}
+        self._number = 0
+        self._sent: deque[Outgoing] = deque(maxlen=_MOST_KEPT)
+        self._sent_count = 0
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def put(self, message: str | bytes, key: Hashable | None = None) -> None:
+    def put(self, message: Outgoing, key: Hashable | None = None) -> None:
         if key is None:
-            self._count += 1
-            key = self._count
+            self._number += 1
+            key = self._number
         self._waiting.pop(key, None)
         self._waiting[key] = message
 
@@ -25,7 +43,29 @@ class Outbox:
         """The oldest message; None if none waits."""
         if not self._waiting:
             return None
-        return self._waiting.pop(next(iter(self._waiting)))
+        message = self._waiting.pop(next(iter(self._waiting)))
+        if message.is_counted:
+            self._sent.append(message)
+            self._sent_count += 1
+        return message.data
 
-    def clear(self) -> None:
+    def begin(self) -> None:
+        """A new stream begins, of which nothing waits and nothing was sent."""
         self._waiting.clear()
+        self._sent.clear()
+        self._sent_count = 0
+
+    def put_first(self, messages: list[Outgoing]) -> None:
+        """Put messages before those that wait."""
+        waiting = self._waiting
+        self._waiting = {}
+        for message in messages:
+            self.put(message)
+        self._waiting |= waiting
+
+    def resume(self, handled: int) -> None:
+        """The server has handled so many counted messages of this stream. The others wait again, before all else."""
+        lost = min(max(0, self._sent_count - handled), len(self._sent))
+        again = [self._sent.pop() for _ in range(lost)][::-1]
+        self._sent_count -= lost
+        self.put_first(again)

@@ -16,8 +16,10 @@ class Player:
     ) -> None:
         try:
             import sounddevice
-        except (ImportError, OSError) as exc:  # OSError: there is no PortAudio
-            raise MissingExtraError("sounddevice with PortAudio", "play", "playing") from exc
+        except ImportError as exc:
+            raise MissingExtraError("sounddevice", "play", "playing") from exc
+        except OSError as exc:
+            raise DeviceError("device: there is no PortAudio; on Debian, apt-get install libportaudio2") from exc
         self._stream = stream
         try:
             self._output = sounddevice.OutputStream(

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypedDict
 
 from nafir_client.errors import ProtocolError, RefusedError
 from nafir_client.live_input import LiveInput
-from nafir_client.outbox import Outbox
+from nafir_client.outbox import Outbox, Outgoing
 from nafir_client.pose import Orientation, Pose, Position
 from nafir_client.scene import Welcome
 from nafir_client.stream_statistics import StreamStatistics
@@ -30,6 +30,8 @@ from nafir_client.wire import (
 Message = Mapping[str, Any]
 """A text message of the server. Its `type` says which fields it has."""
 _ACKNOWLEDGE_EVERY = 4
+_UNCOUNTED = frozenset({"move_emitter", "acknowledge", "ping"})
+_TOKEN_UNKNOWN = "unknown_resume_token"
 _REFUSALS_OF_FORM = frozenset({"malformed_message", "malformed_pose", "malformed_directivity", "message_too_large"})
 """Errors about messages that the server could not read, so that it cannot say which emitter they were about."""
 
@@ -61,6 +63,10 @@ class EmitterOptions(TypedDict, total=False):
     plays what is written to it, of which `ahead_blocks` (4) are kept waiting at the server. Without a `position` it is
     where the scene suggests. `yaw` or `orientation` turn it, which matters with a `directivity` only. `id` is its name
     in messages of the server; without one it gets one.
+
+    A clip begins at the clock `start_at` of the stream, to the sample, or at once, `offset_s` seconds into it; a loop
+    goes from `loop_start_s` to `loop_end_s`. It fades out at the clock `stop_at`. With `remove_when_ended` its emitter
+    is removed once all of its sound has been heard.
     """
 
     clip: str
@@ -72,6 +78,12 @@ class EmitterOptions(TypedDict, total=False):
     directivity: Mapping[str, Any]
     id: str
     ahead_blocks: int
+    start_at: int
+    stop_at: int
+    offset_s: float
+    loop_start_s: float
+    loop_end_s: float
+    remove_when_ended: bool
 
 
 class SessionEmitter:
@@ -84,7 +96,15 @@ class SessionEmitter:
         self.is_heard = False
         """Whether the server of the present connection has said that it is heard."""
         self.start_clock = 0
-        """The clock from which on it is heard, or was in the last connection."""
+        """The clock from which on it is heard, or was in the last stream of the server's."""
+        self.has_ended = False
+        """Whether all sound of its clip has been heard."""
+        self.pose_id = 0
+        """That of its newest move."""
+
+    @property
+    def plays_once(self) -> bool:
+        return "clip" in self.fields and not self.fields.get("loop", True)
 
 
 class Session:
@@ -107,14 +127,34 @@ class Session:
         self._clock_offset = 0
         """What is added to the server's clock."""
         self._next_pose_id = 1
+        self._listener_pose_id = 0
+        self._resume_token: str | None = None
+        self._last_block: tuple[int, int] | None = None
+        """The number and the server's clock of the newest block."""
+        self._restored: list[SessionEmitter] = []
+        """What a new stream is to have of the last one."""
         self._pings: dict[int, float] = {}
         self._ping_id = 0
 
-    def hello(self) -> str:
-        """The first message of a connection. What the stream had before is asked for next."""
-        self.outbox.clear()
-        for emitter in self.emitters.values():
-            self._add(emitter)
+    def first_message(self) -> str:
+        """That of a connection: it resumes the stream, if the server has given a token for that, or opens one."""
+        if self._resume_token is None:
+            return self._open()
+        resume: dict[str, Any] = {"type": "resume", "protocol": PROTOCOL, "token": self._resume_token}
+        if self._last_block is not None:
+            resume["sequence"], resume["sample_clock"] = self._last_block
+        return json.dumps(resume)
+
+    def _open(self) -> str:
+        """A hello. What the stream had before is asked for once it is answered."""
+        self.outbox.begin()
+        for emitter in tuple(self.emitters.values()):
+            if emitter.has_ended or (emitter.plays_once and emitter.is_heard):
+                emitter.has_ended = True  # what plays once is not played again
+                del self.emitters[emitter.id]
+            emitter.is_heard = False
+        self._restored = list(self.emitters.values())
+        self._last_block = None
         hello = dict(self._hello)
         if self.listener is not None:
             hello["listener"] = {"position": self.listener.position, "orientation": self.listener.orientation}
@@ -123,26 +163,46 @@ class Session:
         return json.dumps(hello)
 
     def greet(self, data: str | bytes, now_s: float) -> Welcome:
-        """Take the answer to a hello. Raises RefusedError or ProtocolError."""
-        answer = _read(data) if isinstance(data, str) else {"type": "a block"}
+        """Take the answer to the first message. Raises RefusedError or ProtocolError."""
+        answer: dict[str, Any] = _read(data) if isinstance(data, str) else {"type": "a block"}
         if answer["type"] == "error":
-            raise refusal(answer)
+            error = refusal(answer)
+            if error.code == _TOKEN_UNKNOWN:
+                self._resume_token = None
+            raise error
         if answer["type"] != "welcome":
-            raise ProtocolError(f"the server answers a hello with {answer['type']}")
+            raise ProtocolError(f"the server answers a first message with {answer['type']}")
         is_first, self.welcome = self.welcome is None, Welcome.read(answer)
         self.level = self.welcome.level
         self.last_error = None
         self._pings.clear()
-        if not is_first:
-            self._clock_offset = self._continued(self.welcome, now_s)
+        self._resume_token = answer.get("resume_token")
+        resumed = answer.get("resumed")
+        if resumed is not None:
+            self._resume(resumed["pose_id"], resumed["handled"], now_s)
+        else:
+            if not is_first:
+                self._clock_offset = self._continued(self.welcome, now_s)
+            self.outbox.put_first([self._added(emitter) for emitter in self._restored])
         return self.welcome
+
+    def _resume(self, pose_id: int, handled: int, now_s: float) -> None:
+        """The stream goes on where it was: what the server has not got is sent again."""
+        self.outbox.resume(handled)
+        if self.listener is not None and self._listener_pose_id > pose_id:
+            self.move_listener(self.listener, now_s)
+        for emitter in self.emitters.values():
+            if emitter.pose_id > pose_id:
+                orientation = emitter.fields.get("orientation")
+                self.move_emitter(emitter, emitter.fields["position"], orientation, now_s)
+            if emitter.live and emitter.is_heard:
+                emitter.live.open()
 
     def disconnect(self) -> None:
         """The connection is lost, and what was on its way."""
         self.statistics.pose_to_sound.forget()
         self.statistics.pose_to_reverberation.forget()
         for emitter in self.emitters.values():
-            emitter.is_heard = False
             if emitter.live:
                 emitter.live.close()
 
@@ -156,8 +216,8 @@ class Session:
     def move_listener(self, pose: Pose, now_s: float) -> int:
         """Returns the pose id, which blocks name once they are heard from there."""
         self.listener = pose
-        pose_id = self._new_pose(now_s)
-        self.outbox.put(pose_bytes(pose, pose_id), "listener")
+        self._listener_pose_id = pose_id = self._new_pose(now_s)
+        self.outbox.put(Outgoing(pose_bytes(pose, pose_id)), "listener")
         return pose_id
 
     def add_emitter(self, fields: dict[str, Any], live: LiveInput | None) -> SessionEmitter:
@@ -165,7 +225,7 @@ class Session:
         if fields["id"] in self.emitters:
             raise RefusedError("duplicate_emitter", f"emitter {fields['id']!r} is already there", field="id")
         emitter = self.emitters[fields["id"]] = SessionEmitter(fields, live)
-        self._add(emitter)
+        self.outbox.put(self._added(emitter))
         return emitter
 
     def move_emitter(
@@ -177,13 +237,20 @@ class Session:
             emitter.fields.pop("yaw", None)
             moved["orientation"] = orientation
         emitter.fields.update(moved)
-        pose_id = self._new_pose(now_s)
+        emitter.pose_id = pose_id = self._new_pose(now_s)
         self._put({"type": "move_emitter", "id": emitter.id, "pose_id": pose_id, **moved}, ("move", emitter.id))
         return pose_id
 
-    def set_gain(self, emitter: SessionEmitter, gain_db: float) -> None:
+    def set_gain(self, emitter: SessionEmitter, gain_db: float, ramp_s: float) -> None:
         emitter.fields["gain_db"] = gain_db
-        self._put({"type": "set_gain", "id": emitter.id, "gain_db": gain_db}, ("gain", emitter.id))
+        ramp = {"ramp_s": ramp_s} if ramp_s else {}
+        self._put({"type": "set_gain", "id": emitter.id, "gain_db": gain_db, **ramp}, ("gain", emitter.id))
+
+    def stop_emitter(self, emitter: SessionEmitter, stop_at: int | None, fade_s: float) -> None:
+        """Let its clip fade out from a clock on, or at once."""
+        at = {} if stop_at is None else {"stop_at": max(0, stop_at - self._clock_offset)}
+        emitter.fields["loop"] = False  # what was stopped is not begun again by a new connection
+        self._put({"type": "stop_emitter", "id": emitter.id, "fade_s": fade_s, **at})
 
     def remove_emitter(self, emitter: SessionEmitter) -> None:
         if self.emitters.pop(emitter.id, None) is not None:
@@ -220,14 +287,19 @@ class Session:
 
     def _put_dry(self, emitter: SessionEmitter, live: LiveInput, samples: Samples) -> None:
         encoding: Encoding = "s16" if self._hello["encoding"] == "s16" else "f32"
-        self.outbox.put(dry_bytes(emitter.id, live.sequence, samples, encoding))
+        self.outbox.put(Outgoing(dry_bytes(emitter.id, live.sequence, samples, encoding)))
         live.sequence += 1
 
-    def _add(self, emitter: SessionEmitter) -> None:
-        self._put({"type": "add_emitter", **emitter.fields})
+    def _added(self, emitter: SessionEmitter) -> Outgoing:
+        """What adds an emitter, with the server's clock in place of the session's."""
+        fields = dict(emitter.fields)
+        for name in ("start_at", "stop_at"):
+            if name in fields:
+                fields[name] = max(0, fields[name] - self._clock_offset)
+        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True)
 
     def _put(self, message: Mapping[str, Any], key: object = None) -> None:
-        self.outbox.put(json.dumps(message), key)
+        self.outbox.put(Outgoing(json.dumps(message), is_counted=message["type"] not in _UNCOUNTED), key)
 
     def _new_pose(self, now_s: float) -> int:
         pose_id, self._next_pose_id = self._next_pose_id, self._next_pose_id + 1
@@ -247,6 +319,7 @@ class Session:
         counts.pose_to_sound.receive(block.pose_id, now_s)
         counts.pose_to_reverberation.receive(block.reverberation_pose_id, now_s)
         self.next_clock = block.sample_clock + block.frames
+        self._last_block = block.sequence, block.sample_clock - self._clock_offset
         self._arrived_s = now_s
         if block.sequence % _ACKNOWLEDGE_EVERY == _ACKNOWLEDGE_EVERY - 1:
             self._put({"type": "acknowledge", "sequence": block.sequence}, "acknowledge")
@@ -273,6 +346,11 @@ class Session:
                 if emitter.live:
                     emitter.live.open()
                     self.pump()
+            case {"type": "emitter_ended", "id": identifier} if identifier in self.emitters:
+                emitter = self.emitters[identifier]
+                emitter.has_ended = True
+                if message.get("removed"):
+                    del self.emitters[identifier]
             case {"type": "level_changed", "level": level}:
                 self.level = level
             case {"type": "status", "live": live}:

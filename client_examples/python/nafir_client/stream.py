@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from types import TracebackType
-from typing import Any, Self, TypeVar, Unpack
+from typing import Any, Final, Self, TypeVar, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,15 @@ _KEPT_S = 4.0
 """Blocks of this much time may wait to be taken."""
 _MOST_WAITING = 1_000
 """Messages that may wait to be sent before callers have to wait."""
+_OF_CLIPS: Final = (
+    "loop",
+    "start_at",
+    "stop_at",
+    "offset_s",
+    "loop_start_s",
+    "loop_end_s",
+    "remove_when_ended",
+)
 _LIVE_S = 1.0
 """Samples of this much time may wait in a live emitter."""
 
@@ -107,8 +116,22 @@ class Emitter:
         """Move it; without yaw and orientation its front keeps its direction. Returns the pose's id."""
         return await self._stream.move_emitter(self._state, position, yaw=yaw, orientation=orientation)
 
-    async def set_gain(self, gain_db: float) -> None:
-        await self._stream.change(lambda session: session.set_gain(self._state, gain_db))
+    @property
+    def has_ended(self) -> bool:
+        """Whether all sound of its clip has been heard."""
+        return self._state.has_ended
+
+    async def set_gain(self, gain_db: float, *, ramp_s: float = 0.0) -> None:
+        """Change its gain, by a ramp of so many seconds."""
+        await self._stream.change(lambda session: session.set_gain(self._state, gain_db, ramp_s))
+
+    async def stop(self, *, at: int | None = None, fade_s: float = 0.01) -> None:
+        """Let its clip fade out, from the clock `at` on or at once."""
+        await self._stream.change(lambda session: session.stop_emitter(self._state, at, fade_s))
+
+    async def wait_until_ended(self) -> None:
+        """Return once all sound of its clip has been heard. Raises NafirClientError if the stream ends first."""
+        await self._stream.wait_until_ended(self._state)
 
     async def remove(self) -> None:
         await self._stream.change(lambda session: session.remove_emitter(self._state))
@@ -153,6 +176,7 @@ class Stream:
         self._has_news = asyncio.Event()
         self._has_outgoing = asyncio.Event()
         self._has_room = asyncio.Event()
+        self._has_message = asyncio.Event()
         self._adding: dict[str, asyncio.Future[None]] = {}
         self._numbers = itertools.count(1)
         self._task: asyncio.Task[None] | None = None
@@ -257,6 +281,12 @@ class Stream:
             self._adding.pop(state.id, None)
         return Emitter(self, state)
 
+    async def wait_until_ended(self, state: SessionEmitter) -> None:
+        while not state.has_ended:
+            self._require_open()
+            self._has_message.clear()
+            await self._has_message.wait()
+
     async def set_level(self, level: str) -> None:
         """Choose a quality level, or `auto`. A `level_changed` says from when on it is heard."""
         await self.change(lambda session: session.set_level(level))
@@ -319,7 +349,8 @@ class Stream:
             fields["directivity"] = dict(options["directivity"])
         clip = options.get("clip")
         if clip is not None:
-            return {**fields, "clip": clip, "loop": options.get("loop", True)}, None
+            fields.update({name: options[name] for name in _OF_CLIPS if name in options})
+            return {"loop": True, **fields, "clip": clip}, None
         ahead = options.get("ahead_blocks", 4) * self.block_size
         live = LiveInput(self.block_size, ahead=ahead, longest=ahead + round(_LIVE_S * self.sample_rate))
         return {**fields, "live": True}, live
@@ -364,7 +395,7 @@ class Stream:
         try:
             async with asyncio.timeout(_WELCOME_S):
                 with contextlib.suppress(ConnectionClosed):  # a server that is not ready says so before it goes
-                    await socket.send(self._session.hello())
+                    await socket.send(self._session.first_message())
                 self._session.greet(await socket.recv(), time.monotonic())
         except ConnectionClosed as exc:
             raise _lost(self.url, exc, None) from exc
@@ -430,6 +461,7 @@ class Stream:
             self._blocks.append(received)
             self._has_news.set()
         elif received is not None:
+            self._has_message.set()
             self._settle(received)
             if self._on_message is not None:
                 self._on_message(received)
@@ -464,7 +496,7 @@ class Stream:
         for added in self._adding.values():
             if not added.done():
                 added.set_exception(self._failure)
-        for event in (self._has_news, self._has_room, self._has_outgoing):
+        for event in (self._has_news, self._has_room, self._has_message, self._has_outgoing):
             event.set()
 
 

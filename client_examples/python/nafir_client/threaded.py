@@ -93,8 +93,18 @@ class ThreadedEmitter:
         turned = None if yaw is None and orientation is None else pose.orientation
         return self._stream.run_later(lambda: self._emitter.move(pose.position, orientation=turned))
 
-    def set_gain(self, gain_db: float) -> None:
-        self._stream.run_later(lambda: self._emitter.set_gain(gain_db))
+    @property
+    def has_ended(self) -> bool:
+        """Whether all sound of its clip has been heard."""
+        return self._emitter.has_ended
+
+    def set_gain(self, gain_db: float, *, ramp_s: float = 0.0) -> None:
+        """Change its gain, by a ramp of so many seconds."""
+        self._stream.run_later(lambda: self._emitter.set_gain(gain_db, ramp_s=ramp_s))
+
+    def stop(self, *, at: int | None = None, fade_s: float = 0.01) -> None:
+        """Let its clip fade out, from the clock `at` on or at once."""
+        self._stream.run_later(lambda: self._emitter.stop(at=at, fade_s=fade_s))
 
     def remove(self) -> None:
         self._stream.run_later(self._emitter.remove)
