@@ -32,6 +32,12 @@ export class Output extends EventTarget {
     return port2;
   }
 
+  /** Ends the node: it plays nothing any more, and nothing keeps it. */
+  end() {
+    this.node.port.postMessage({ type: "end" });
+    this.node.disconnect();
+  }
+
   #receive(data) {
     if (data.type === "captured") {
       this.#captures.get(data.id)(data);

@@ -2,7 +2,7 @@
 // every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
 import { authorized } from "./http.js";
-import { FLAG_LATE, PROTOCOL, isBlock, message, parseBlock, serializePose } from "./wire.js";
+import { FLAG_LATE, PROTOCOL, isBlock, message, parseBlock, serializeDryBlock, serializePose } from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent
 const ACKNOWLEDGE_EVERY = 4; // blocks
@@ -40,15 +40,17 @@ export class Stream {
   #comeBackMs = null; // after which a server without room said to come back
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
   #asking = 0; // timer that asks for them again
-  #listener; // {position, yaw, at}
-  #emitters = new Map(); // id -> {clip, position, gainDb, at}
+  #encoding = "f32";
+  #listener; // {position, at} and orientation or yaw
+  #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
+  #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
   #dirty = new Set(); // "listener" and emitter ids that moved since they were last sent
   #sentAt = 0;
   #sending = 0;
   #heartbeat = 0;
 
   /**
-   * `hello` is {scene, sampleRate, level, effects, output, order, head}; `listeners` are callbacks: block(block), state({state, ...}),
+   * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block), state({state, ...}),
    * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}).
    */
   constructor({ url, key = null, hello, listener, emitters, listeners }) {
@@ -74,6 +76,7 @@ export class Stream {
     if (!this.#welcomed) return;
     if (!known || known.clip !== clip) {
       if (known) this.#send(message.removeEmitter(id));
+      this.#dry.delete(id);
       this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
       this.#send(message.setGain(emitter));
@@ -83,8 +86,17 @@ export class Stream {
     }
   }
 
+  /** Sends the next mono samples of a live emitter. They are dropped while it is not heard yet. */
+  feed(id, samples) {
+    const sequence = this.#dry.get(id);
+    if (sequence === undefined || !this.#welcomed) return;
+    this.#dry.set(id, sequence + 1);
+    this.#send(serializeDryBlock({ id, sequence, samples }));
+  }
+
   removeEmitter(id) {
     if (!this.#emitters.delete(id)) return;
+    this.#dry.delete(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
     if (this.#welcomed) this.#send(message.removeEmitter(id));
@@ -131,6 +143,7 @@ export class Stream {
   #detach() {
     clearTimeout(this.#asking);
     this.#missing.clear();
+    this.#dry.clear();
     clearInterval(this.#watchdog);
     clearInterval(this.#heartbeat);
     const socket = this.#socket;
@@ -146,8 +159,8 @@ export class Stream {
     const socket = new WebSocket(this.#url, protocolsFor(this.#key));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      const { position, yaw, at } = this.#listener;
-      socket.send(message.hello({ ...this.#hello, listener: { position, yaw }, emitters: this.#emitters.size }));
+      const { at, ...listener } = this.#listener;
+      socket.send(message.hello({ ...this.#hello, listener, emitters: this.#emitters.size }));
       this.#poseId = 0; // the hello's listener is pose 0
       this.#listeners.posed({ poseId: 0, at: Math.max(at, now()) });
     };
@@ -199,7 +212,7 @@ export class Stream {
     else if (received.type === "status") this.#listeners.status(received);
     else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "plan_changed") this.#listeners.effects(received);
-    else if (received.type === "emitter_added") this.#missing.delete(received.id);
+    else if (received.type === "emitter_added") this.#added(received.id);
     else if (received.type === "error") {
       this.#lastError = received.message;
       const comeBackMs = received.retry_after_s ? 1000 * received.retry_after_s : null;
@@ -214,8 +227,14 @@ export class Stream {
     }
   }
 
+  #added(id) {
+    this.#missing.delete(id);
+    if (this.#emitters.get(id)?.live) this.#dry.set(id, 0);
+  }
+
   #welcome(welcome) {
     this.#welcomed = true;
+    this.#encoding = welcome.encoding;
     this.#attempt = 0;
     this.#lastError = null;
     this.#dirty.clear();
@@ -232,7 +251,7 @@ export class Stream {
   #receiveBlock(buffer) {
     this.#heardAt = now();
     if (!isBlock(buffer)) return; // a newer server may send other kinds
-    const block = parseBlock(buffer);
+    const block = parseBlock(buffer, this.#encoding);
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
     this.#listeners.block({ ...block, late: (block.flags & FLAG_LATE) !== 0 });
   }
@@ -249,14 +268,14 @@ export class Stream {
   #sendPoses() {
     if (!this.#welcomed) return;
     this.#sentAt = now();
-    for (const { id, position, at } of this.#emitters.values()) {
+    for (const { id, position, orientation, at } of this.#emitters.values()) {
       if (!this.#dirty.has(`emitter ${id}`)) continue;
-      this.#send(message.moveEmitter({ id, position, poseId: ++this.#poseId }));
+      this.#send(message.moveEmitter({ id, position, orientation, poseId: ++this.#poseId }));
       this.#listeners.posed({ poseId: this.#poseId, at });
     }
     if (this.#dirty.has("listener")) {
-      const { position, yaw, at } = this.#listener;
-      this.#send(serializePose({ poseId: ++this.#poseId, position, yaw }));
+      const { at, ...pose } = this.#listener;
+      this.#send(serializePose({ poseId: ++this.#poseId, ...pose }));
       this.#listeners.posed({ poseId: this.#poseId, at });
     }
     this.#dirty.clear();

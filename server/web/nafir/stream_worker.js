@@ -31,16 +31,31 @@ function open({ url, key, hello, listener, emitters, port }) {
   });
 }
 
+// The samples of a live emitter come through a port of their own, from the worklet that takes them.
+const taps = new Map();
+
+function tap({ id, port }) {
+  taps.get(id)?.close();
+  taps.set(id, port);
+  port.onmessage = ({ data: samples }) => stream?.feed(id, samples);
+}
+
 const commands = {
   open,
+  tap,
   listener: (detail) => stream?.setListener(detail),
   emitter: (detail) => stream?.setEmitter(detail),
-  remove: ({ id }) => stream?.removeEmitter(id),
+  remove({ id }) {
+    stream?.removeEmitter(id);
+    taps.get(id)?.close();
+    taps.delete(id);
+  },
   level: ({ name }) => stream?.setLevel(name),
   renew: (changes) => stream?.renew(changes),
   effects: (wishes) => stream?.setEffects(wishes),
   close() {
-    stream?.close();
+    if (stream) stream.close();
+    else self.postMessage({ type: "state", detail: { state: "closed" } });
     stream = null;
   },
 };

@@ -5,20 +5,41 @@ export const PROTOCOL = 3;
 
 const AUDIO_BLOCK = 1;
 const LISTENER_POSE = 2;
+const DRY_BLOCK = 3;
 const BLOCK_HEADER_BYTES = 28;
 const POSE_BYTES = 36;
+const DRY_HEADER_BYTES = 12;
+const FULL_SCALE = 32767; // of s16
 const CHANNELS = [1, 2, 4, 9, 16];
 
 export const FLAG_LATE = 2;
 
-/** A listener pose as a binary message. `position` is [x, y, z], and `yaw` turns counter-clockwise from +x. */
-export function serializePose({ poseId, position, yaw }) {
+/** [x, y, z, w] of a pose that has it as `orientation`, or a `yaw` counter-clockwise from +x, or neither. */
+export const orientationOf = ({ orientation, yaw = 0 }) => orientation ?? [0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)];
+
+/** A listener pose as a binary message. `position` is [x, y, z]; the direction is an orientation or a yaw. */
+export function serializePose({ poseId, position, ...direction }) {
   const buffer = new ArrayBuffer(POSE_BYTES);
   const view = new DataView(buffer);
   view.setUint8(0, LISTENER_POSE);
   view.setUint32(4, poseId, true);
-  const floats = [...position, 0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)];
+  const floats = [...position, ...orientationOf(direction)];
   floats.forEach((value, index) => view.setFloat32(8 + 4 * index, value, true));
+  return buffer;
+}
+
+/** The next mono samples (Float32Array) of a live emitter. `sequence` rises from block to block. */
+export function serializeDryBlock({ id, sequence, samples }) {
+  const name = new TextEncoder().encode(id);
+  const start = DRY_HEADER_BYTES + 4 * Math.ceil(name.length / 4);
+  const buffer = new ArrayBuffer(start + 4 * samples.length);
+  const view = new DataView(buffer);
+  view.setUint8(0, DRY_BLOCK);
+  view.setUint16(2, name.length, true);
+  view.setUint32(4, sequence, true);
+  view.setUint32(8, samples.length, true);
+  new Uint8Array(buffer).set(name, DRY_HEADER_BYTES);
+  samples.forEach((sample, index) => view.setFloat32(start + 4 * index, sample, true));
   return buffer;
 }
 
@@ -28,22 +49,25 @@ export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer)
 /**
  * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, channels}. `channels` are Float32Array(frames):
  * both ears, equal if the block has one channel, or 4, 9 or 16 of ambisonics. The poses are the newest of the direct sound and of the
- * reflected field.
+ * reflected field. `encoding` is that of the welcome: f32 or s16.
  */
-export function parseBlock(buffer) {
+export function parseBlock(buffer, encoding = "f32") {
   const view = new DataView(buffer);
   if (buffer.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) {
     throw new TypeError("not an audio block");
   }
   const count = view.getUint16(2, true);
   const frames = view.getUint32(24, true);
-  if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * 4) {
+  const bytes = encoding === "s16" ? 2 : 4;
+  if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * bytes) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${count} channels`);
   }
   const channels = Array.from({ length: Math.max(2, count) }, () => new Float32Array(frames));
   channels.forEach((samples, index) => {
-    const first = BLOCK_HEADER_BYTES + 4 * Math.min(index, count - 1);
-    for (let frame = 0; frame < frames; frame++) samples[frame] = view.getFloat32(first + 4 * count * frame, true);
+    let at = BLOCK_HEADER_BYTES + bytes * Math.min(index, count - 1);
+    for (let frame = 0; frame < frames; frame++, at += bytes * count) {
+      samples[frame] = bytes === 2 ? view.getInt16(at, true) / FULL_SCALE : view.getFloat32(at, true);
+    }
   });
   return {
     flags: view.getUint8(1),
@@ -57,15 +81,17 @@ export function parseBlock(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, level, effects, output, order, head, listener, emitters }) =>
+  hello: ({ scene, sampleRate, encoding = "f32", level, effects, output, order, head, bufferBlocks, listener, emitters }) =>
     JSON.stringify({
-      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding: "f32", level, effects, output, order, hrtf: head, listener, emitters,
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, level, effects, output, order, hrtf: head,
+      buffer_blocks: bufferBlocks, listener, emitters,
     }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
-  addEmitter: ({ id, clip, position, gainDb }) => JSON.stringify({ type: "add_emitter", id, clip, position, gain_db: gainDb }),
+  addEmitter: ({ id, clip, live, loop, position, orientation, directivity, gainDb }) =>
+    JSON.stringify({ type: "add_emitter", id, clip, live, loop, position, orientation, directivity, gain_db: gainDb }),
   setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),
-  moveEmitter: ({ id, position, poseId }) => JSON.stringify({ type: "move_emitter", id, position, pose_id: poseId }),
+  moveEmitter: ({ id, position, orientation, poseId }) => JSON.stringify({ type: "move_emitter", id, position, orientation, pose_id: poseId }),
   removeEmitter: (id) => JSON.stringify({ type: "remove_emitter", id }),
   acknowledge: (sequence) => JSON.stringify({ type: "acknowledge", sequence }),
 };

@@ -24,8 +24,9 @@ export class WorkerStream extends EventTarget {
     this.#worker.postMessage({ type, detail }, transfer);
   }
 
-  /** Ends the worker with its stream. */
-  terminate() {
-    this.#worker.terminate();
+  /** Closes the stream, and ends the worker when that is done. */
+  end() {
+    this.addEventListener("state", ({ detail }) => detail.state === "closed" && this.#worker.terminate());
+    this.tell("close");
   }
 }

@@ -6,6 +6,7 @@ import { HeadDecoder } from "./ambisonics.js";
 import { JitterBuffer } from "./jitterbuffer.js";
 
 const QUANTUM = 128; // samples that the Web Audio API processes at once
+const BLOCK = 256; // samples of a live emitter that are sent at once
 const REPORT_QUANTA = 5; // about 27 ms at 24 kHz
 const TAP_S = 12;
 
@@ -21,6 +22,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     this.ending = null; // last quantum of a stream that had other channels
     this.tap = [new Float32Array(TAP_S * sampleRate), new Float32Array(TAP_S * sampleRate)];
     this.tapped = 0; // samples written to the tap since the start
+    this.isOpen = true;
     this.feed = null; // port of the stream worker
     this.quanta = 0;
     this.peak = [0, 0];
@@ -33,6 +35,9 @@ class NafirPlayer extends AudioWorkletProcessor {
       this.feed?.close();
       this.feed = data.port;
       this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : this.buffer.push(block));
+    } else if (data.type === "end") {
+      this.isOpen = false;
+      this.feed?.close();
     } else if (data.type === "capture") {
       this.#capture(data);
     } else if (data.type === "head") {
@@ -97,7 +102,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     this.tapped += output[0].length;
     this.quanta += 1;
     if (this.quanta === REPORT_QUANTA) this.#report(output[0].length);
-    return true;
+    return this.isOpen;
   }
 
   /** Says which turns of the head this quantum is the first to have. */
@@ -141,4 +146,39 @@ class NafirPlayer extends AudioWorkletProcessor {
   }
 }
 
+/** Takes the sound of a live emitter: the mean of its channels, a block at a time, to a port that it is given. */
+class NafirTap extends AudioWorkletProcessor {
+  constructor() {
+    super();
+    this.block = new Float32Array(BLOCK);
+    this.filled = 0;
+    this.to = null;
+    this.isOpen = true;
+    this.port.onmessage = ({ data }) => {
+      this.to?.close();
+      this.to = data.port ?? null;
+      this.isOpen = this.to !== null;
+    };
+  }
+
+  process([channels]) {
+    // Without anything connected there are no channels, and nothing is sent: silence would cost as much as sound.
+    if (channels.length > 0) this.#take(channels);
+    return this.isOpen;
+  }
+
+  #take(channels) {
+    for (let i = 0; i < channels[0].length; i++) {
+      let sum = 0;
+      for (const samples of channels) sum += samples[i];
+      this.block[this.filled++] = sum / channels.length;
+      if (this.filled < BLOCK) continue;
+      this.to?.postMessage(this.block, [this.block.buffer]);
+      this.block = new Float32Array(BLOCK);
+      this.filled = 0;
+    }
+  }
+}
+
 registerProcessor("nafir-player", NafirPlayer);
+registerProcessor("nafir-tap", NafirTap);

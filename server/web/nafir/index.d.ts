@@ -1,0 +1,168 @@
+/** [x, y, z] in metres: x east, y north, z up. */
+export type Position = readonly [number, number, number];
+/** A quaternion [x, y, z, w] whose identity looks along +x. */
+export type Orientation = readonly [number, number, number, number];
+
+export interface Direction {
+  orientation?: Orientation;
+  /** Of a level head or emitter: radians counter-clockwise from +x. */
+  yaw?: number;
+}
+
+export interface Pose extends Direction {
+  position: Position;
+}
+
+export type State = "connecting" | "live" | "waiting" | "refused" | "closed";
+
+export interface StateDetail {
+  state: State;
+  attempt?: number;
+  /** Of "live". */
+  welcome?: Welcome;
+  /** Of "waiting" and "refused". */
+  reason?: string;
+  /** Of "waiting": milliseconds until the next attempt. */
+  retryMs?: number;
+  /** Of "waiting": whether the server has no room. */
+  isBusy?: boolean;
+  /** Of "refused": whether another key may help. */
+  needsKey?: boolean;
+}
+
+/** The server's answer to a hello; docs/reference/stream.md has all of it. */
+export interface Welcome {
+  type: "welcome";
+  session: string;
+  scene: { id: string; name: string; bounds: { minimum: Position; maximum: Position }; [more: string]: unknown };
+  sample_rate: number;
+  block_size: number;
+  channels: number;
+  encoding: "f32" | "s16";
+  level: string;
+  order?: number;
+  max_emitters: number | null;
+  [more: string]: unknown;
+}
+
+/** An error of the server, after which the stream goes on. */
+export interface Refusal {
+  code: string;
+  message: string;
+  field: string | null;
+  emitter?: string | null;
+  retry_after_s?: number;
+}
+
+export interface Latency {
+  totalMs: number;
+  worstMs: number;
+  serverMs: number;
+  bufferMs: number;
+  outputMs: number;
+}
+
+export interface Directivity {
+  pattern: "omnidirectional" | "subcardioid" | "cardioid" | "supercardioid" | "hypercardioid" | "figure_of_eight" | "measured";
+  order?: number;
+  angles_deg?: readonly number[];
+  gains_db?: readonly (readonly number[])[];
+}
+
+export interface Placed {
+  get position(): Position;
+  set position(position: Position);
+  get orientation(): Orientation;
+  set orientation(orientation: Orientation);
+  /** Turns a level head or emitter: radians counter-clockwise from +x. */
+  set yaw(yaw: number);
+  /** Sets position and direction together. What is left out stays. */
+  move(pose: Partial<Pose>): void;
+}
+
+export interface Emitter extends Placed {
+  readonly id: string;
+  /** Takes the sound of a live emitter; null if it plays a clip of the server. */
+  readonly input: AudioNode | null;
+  gainDb: number;
+  remove(): void;
+}
+
+export interface EmitterOptions extends Pose {
+  id?: string;
+  /** One of GET /v1/clips. Without it, the emitter plays what `source` does or what is connected to its `input`. */
+  clip?: string;
+  source?: AudioNode;
+  /** Whether a clip is played again and again; true if left out. */
+  loop?: boolean;
+  gainDb?: number;
+  directivity?: Directivity;
+}
+
+interface NafirEvents {
+  state: CustomEvent<StateDetail>;
+  refused: CustomEvent<Refusal>;
+  level: CustomEvent<{ level: string; reason: string; [more: string]: unknown }>;
+  effects: CustomEvent<{ decisions: readonly unknown[]; [more: string]: unknown }>;
+  status: CustomEvent<{ [figure: string]: unknown }>;
+}
+
+export interface Nafir extends EventTarget {
+  /** What the listener hears, in two channels: connect it. */
+  readonly output: AudioNode;
+  readonly listener: Placed;
+  readonly state: State;
+  readonly welcome: Welcome | null;
+  readonly emitters: ReadonlyMap<string, Emitter>;
+  addEmitter(options: EmitterOptions): Emitter;
+  removeEmitter(id: string): void;
+  /** Chooses a quality level of the scene, or "auto". */
+  set level(name: string);
+  /** Switches effects on or off by name; null leaves one to the server's plan. */
+  setEffects(effects: Record<string, boolean | null>): void;
+  /** From setting a pose to its sound, medians of the last seconds. */
+  readonly latency: { direct: Latency | null; reverberation: Latency | null };
+  /** The last seconds that were heard, at most twelve. */
+  capture(seconds: number): Promise<{ left: Float32Array; right: Float32Array }>;
+  close(): void;
+  addEventListener<T extends keyof NafirEvents>(type: T, listener: (event: NafirEvents[T]) => void, options?: AddEventListenerOptions): void;
+  addEventListener(type: string, listener: EventListenerOrEventListenerObject | null, options?: boolean | AddEventListenerOptions): void;
+}
+
+export interface ConnectOptions {
+  scene: string;
+  /** An API key or token, if the server asks for one. */
+  key?: string | null;
+  /** Without it, where a visit of the scene begins. */
+  listener?: Pose;
+  level?: string;
+  effects?: Record<string, boolean>;
+  /** One of GET /v1/hrtfs. */
+  head?: string;
+  /** Of ambisonics, 1 to 3: turns of the head are then heard at once. */
+  order?: 1 | 2 | 3;
+  /** s16 takes half the bytes of f32, which is used if left out. */
+  encoding?: "f32" | "s16";
+  bufferBlocks?: number;
+  /** Ends the attempt. */
+  signal?: AbortSignal;
+  /** Where this package's files are, for bundlers that move them. */
+  assets?: string | URL;
+}
+
+/** A stream that was refused; `code` is one of the server's error codes. */
+export class RefusedError extends Error {
+  readonly code: string | null;
+}
+
+/** A request over HTTP that failed. */
+export class RequestError extends Error {
+  readonly code: string;
+  readonly status: number;
+}
+
+/** Opens a stream of a server and makes an AudioNode of it. Resolves when the server has welcomed it. */
+export function connect(context: AudioContext, url: string | URL, options: ConnectOptions): Promise<Nafir>;
+
+/** An AudioNode with the sound of a microphone. Asks the user. */
+export function microphone(context: AudioContext, constraints?: MediaTrackConstraints): Promise<MediaStreamAudioSourceNode>;

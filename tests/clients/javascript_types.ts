@@ -1,0 +1,36 @@
+// Compiled by test_javascript.py, not run: what a user writes has the types that it should.
+
+import * as THREE from "three";
+import { connect, microphone, RefusedError, type Emitter, type Latency } from "nafir-client";
+import { bind, poseOf } from "nafir-client/three";
+import { useEmitter, useNafir } from "nafir-client/react";
+
+export async function listen(context: AudioContext): Promise<Latency | null> {
+  const nafir = await connect(context, "https://sound.example", { scene: "apartment", order: 1, signal: AbortSignal.timeout(5000) });
+  nafir.output.connect(context.destination);
+  const radio: Emitter = nafir.addEmitter({ clip: "woman-reading", position: [6, 3, 1.5], directivity: { pattern: "cardioid" } });
+  radio.position = [5, 3, 1.5];
+  radio.gainDb = -6;
+  nafir.addEmitter({ source: await microphone(context), position: [1, 2, 1.5], yaw: 0.5 });
+  nafir.listener.yaw = 1;
+  nafir.listener.move({ position: [1, 1, 1.6], orientation: [0, 0, 0, 1] });
+  nafir.addEventListener("refused", ({ detail }) => console.warn(detail.code, detail.message));
+  nafir.addEventListener("state", ({ detail }) => console.log(detail.state, detail.retryMs ?? 0));
+  const binding = bind(nafir, new THREE.PerspectiveCamera());
+  binding.add(new THREE.Object3D(), { clip: "trumpet" });
+  binding.update();
+  // @ts-expect-error  a position has three numbers
+  radio.position = [1, 2];
+  // @ts-expect-error  an emitter has a position
+  nafir.addEmitter({ clip: "trumpet" });
+  // @ts-expect-error  ambisonics end at order 3
+  await connect(context, "", { scene: "apartment", order: 4 });
+  return nafir.latency.direct;
+}
+
+export function Hook(): string {
+  const { nafir, state, error, start } = useNafir("/", { scene: "apartment" });
+  const emitter = useEmitter(nafir, { clip: "trumpet", position: [1, 2, 3] });
+  void start();
+  return error instanceof RefusedError ? `${error.code}` : `${state} ${emitter?.id} ${poseOf(new THREE.Object3D()).position[0]}`;
+}

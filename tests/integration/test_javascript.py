@@ -1,0 +1,247 @@
+"""The package for JavaScript in a real browser, on a real server: as an AudioNode, in three.js and in React."""
+
+import base64
+import functools
+import http.server
+import shutil
+import subprocess
+import threading
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import visitor
+
+browser = visitor.browser
+pytestmark = visitor.needs_browser
+
+PACKAGE = Path(__file__).parents[2] / "client_examples" / "javascript"
+needs_packages = pytest.mark.skipif(
+    not (PACKAGE / "node_modules").exists(), reason="run npm install in client_examples/javascript"
+)
+
+RATE = 48_000
+
+_CAPTURE = """async (seconds) => {
+  await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
+  const { left, right } = await nafir.capture(seconds);
+  return [left, right].map((ear) => {
+    const bytes = new Uint8Array(ear.buffer);
+    let text = "";
+    for (let at = 0; at < bytes.length; at += 8192) text += String.fromCharCode(...bytes.subarray(at, at + 8192));
+    return btoa(text);
+  });
+}"""
+
+
+def listen(page, seconds: float = 1.0) -> np.ndarray:
+    """(2, n) what is heard in the seconds to come."""
+    return np.array(
+        [np.frombuffer(base64.b64decode(ear), np.float32) for ear in page.evaluate(_CAPTURE, seconds)], np.float64
+    )
+
+
+@pytest.fixture
+def page(browser, server) -> Iterator:
+    """An empty page of the server's own, with the package as its users import it."""
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(f"{server}/icon.svg")
+    page.evaluate("import('/nafir/index.js').then((module) => (window.package = module))")
+    yield page
+    context.close()
+
+
+_CONNECT = """async (options) => {
+  window.context = new AudioContext({ sampleRate: 48000 });
+  window.nafir = await package.connect(context, location.origin, options);
+  nafir.output.connect(context.destination);
+  window.refusals = [];
+  nafir.addEventListener("refused", ({ detail }) => refusals.push(detail.code));
+}"""
+
+
+def connect(page, **options) -> None:
+    page.evaluate(_CONNECT, {"scene": "apartment", **options})
+
+
+def test_an_emitter_is_heard_where_it_is(page):
+    connect(page, listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+    page.evaluate("window.radio = nafir.addEmitter({ clip: 'woman-reading', position: [2.5, 3.0, 1.5] })")
+    page.wait_for_function("nafir.latency.direct !== null")
+    on_the_left = visitor.level_db(listen(page, 2.0))
+    page.evaluate("radio.position = [2.5, 1.0, 1.5]")
+    page.wait_for_timeout(500)
+    on_the_right = visitor.level_db(listen(page, 2.0))
+    assert on_the_left.max() > -60
+    assert on_the_left[0] - on_the_left[1] > 3
+    assert on_the_right[1] - on_the_right[0] > 3
+    assert page.evaluate("nafir.welcome.sample_rate") == RATE
+    assert page.evaluate("refusals") == []
+
+    page.evaluate("radio.gainDb = -40")
+    page.wait_for_timeout(1500)
+    assert visitor.level_db(listen(page)).max() < on_the_right.max() - 20
+    page.evaluate("radio.remove()")
+    assert page.evaluate("nafir.emitters.size") == 0
+
+
+def test_the_sound_of_a_node_is_heard_from_its_place(page):
+    connect(page, encoding="s16", listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+    page.evaluate("""() => {
+      const oscillator = new OscillatorNode(context, { frequency: 1000 });
+      const gain = new GainNode(context, { gain: 0.5 });
+      window.tone = nafir.addEmitter({ source: oscillator.connect(gain), position: [3.5, 2.0, 1.5] });
+      oscillator.start();
+    }""")
+    page.wait_for_function("nafir.latency.direct !== null")
+    page.wait_for_timeout(1000)
+    heard = listen(page)[0]
+    spectrum = np.abs(np.fft.rfft(heard * np.hanning(len(heard))))
+    loudest = np.argmax(spectrum) * RATE / len(heard)
+    assert loudest == pytest.approx(1000, abs=3)
+    assert visitor.level_db(heard) > -50
+    page.evaluate("tone.remove()")
+    page.wait_for_timeout(2000)
+    assert visitor.level_db(listen(page)).max() < -70
+    assert page.evaluate("refusals") == []
+
+
+def test_a_head_that_turns_in_the_browser_hears_the_other_side(page):
+    connect(page, order=1, listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+    page.evaluate("nafir.addEmitter({ clip: 'woman-reading', position: [2.5, 3.0, 1.5] })")
+    page.wait_for_function("nafir.latency.direct !== null")
+    before = visitor.level_db(listen(page, 2.0))
+    page.evaluate("nafir.listener.yaw = Math.PI")
+    page.wait_for_timeout(300)
+    after = visitor.level_db(listen(page, 2.0))
+    assert page.evaluate("nafir.welcome.order") == 1
+    assert before[0] - before[1] > 2
+    assert after[1] - after[0] > 2
+
+
+def test_a_refused_stream_says_why(page):
+    failed = """async (options) => {
+      const context = new AudioContext({ sampleRate: 48000 });
+      try {
+        await package.connect(context, location.origin, options);
+      } catch (error) {
+        return [error.constructor.name, error.code];
+      } finally {
+        await context.close();
+      }
+    }"""
+    start = {"position": [1, 1, 1.5]}
+    assert page.evaluate(failed, {"scene": "nowhere"}) == ["RequestError", "unknown_scene"]
+    refused = ["RefusedError", "unknown_scene"]
+    assert page.evaluate(failed, {"scene": "nowhere", "listener": start}) == refused
+    assert page.evaluate(failed, {"scene": "apartment", "level": "none"}) == ["RefusedError", "unknown_level"]
+
+
+def test_a_closed_stream_leaves_nothing_behind(page, server):
+    def streams() -> float:
+        with urllib.request.urlopen(f"{server}/metrics") as answer:
+            lines = answer.read().decode().splitlines()
+        return sum(float(line.split()[-1]) for line in lines if line.startswith("nafir_streams{"))
+
+    before = streams()
+    connect(page)
+    assert streams() == before + 1
+    page.evaluate("nafir.addEmitter({ position: [3, 3, 1.5] })")
+    page.evaluate("nafir.close()")
+    assert page.evaluate("nafir.state") == "closed"
+    for _ in range(50):
+        if streams() == before:
+            break
+        page.wait_for_timeout(100)
+    assert streams() == before
+    assert page.workers == []
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def examples() -> Iterator[tuple[str, str]]:
+    """Addresses of the examples' folder and of a server that lets them in, as the README starts both."""
+    # The package as npm installs it.
+    subprocess.run([shutil.which("node"), "prepare.mjs"], cwd=PACKAGE, check=True)
+    handler = functools.partial(_Quiet, directory=str(PACKAGE))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as files:
+        thread = threading.Thread(target=files.serve_forever)
+        thread.start()
+        origin = f"http://127.0.0.1:{files.server_port}"
+        with visitor.serving(visitor.free_port(), settings={"NAFIR_ALLOWED_ORIGINS": origin}) as server:
+            yield origin, server
+        files.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def visitor_of(browser, examples) -> Iterator:
+    """Opens an example; fails if it leaves an error in the console."""
+    context = browser.new_context()
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+
+    def open_example(name: str):
+        origin, server = examples
+        page.goto(f"{origin}/{name}?server={server}")
+        return page
+
+    yield open_example
+    context.close()
+    assert [each for each in complaints if "favicon" not in each and "404" not in each] == []
+
+
+@needs_packages
+def test_the_example_of_three_js_hears_what_it_shows(visitor_of):
+    page = visitor_of("three.html")
+    page.click("#start")
+    page.wait_for_function("document.getElementById('state').textContent === 'live'")
+    page.evaluate("window.nafir = example.nafir")
+    page.wait_for_function("nafir.latency.direct !== null")
+    assert visitor.level_db(listen(page, 2.0)).max() > -60
+    before = page.evaluate("nafir.listener.position")
+    page.keyboard.down("ArrowUp")
+    page.wait_for_timeout(500)
+    page.keyboard.up("ArrowUp")
+    page.wait_for_timeout(200)
+    there, here = page.evaluate("[example.camera.position.toArray(), nafir.listener.position]")
+    assert np.linalg.norm(np.subtract(here, before)) > 0.2
+    np.testing.assert_allclose([there[0], -there[2], there[1]], here, atol=1e-9)
+    [ball, cube] = page.evaluate("[...nafir.emitters.values()].map(({ position }) => position)")
+    assert np.linalg.norm(np.subtract(ball, cube)) < 1.2
+
+
+@needs_packages
+def test_the_example_of_react_adds_and_removes_what_it_renders(visitor_of):
+    command = ["react.jsx", "--bundle", "--format=esm", "--jsx=automatic", "--outfile=react.bundle.js"]
+    subprocess.run(
+        [PACKAGE / "node_modules" / ".bin" / "esbuild", *command], cwd=PACKAGE, check=True, capture_output=True
+    )
+    page = visitor_of("react.html")
+    page.click("#start")
+    page.wait_for_function("document.getElementById('state').textContent === 'live'")
+    page.wait_for_function("window.nafir?.latency.direct")
+    places = "[...nafir.emitters.values()].map(({ position }) => position[0])"
+    assert page.evaluate(places) == [6]
+    page.fill("#x", "3")
+    assert page.evaluate(places) == [3]
+    page.uncheck("#playing")
+    assert page.evaluate(places) == []
+    page.check("#playing")
+    assert page.evaluate(places) == [3]
+    page.wait_for_timeout(1000)
+    assert visitor.level_db(listen(page, 2.0)).max() > -60
+    page.click("#start")
+    page.wait_for_function("document.getElementById('state').textContent === 'closed'")
+    page.wait_for_timeout(200)
+    assert page.workers == []
