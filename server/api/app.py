@@ -16,9 +16,10 @@ from starlette.types import Scope
 
 from server.api.access import Access
 from server.api.access_gate import AccessGate, page_paths
+from server.api.bundle_folder import BundleFolder
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.compression import Compression
-from server.api.connection import StreamHost
+from server.api.connection import MeasuredScene, StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
 from server.api.first_start import CompilingProcess, tell_while_compiling
@@ -93,7 +94,10 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
-        loaded = await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes
+        loaded = dict(await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes)
+        folder = None if settings.bundle_folder is None else BundleFolder(settings.bundle_folder, dict(loaded))
+        if folder is not None:
+            loaded |= (await asyncio.to_thread(folder.look, is_first=True)).loaded
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
         with (
             Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
@@ -129,7 +133,7 @@ def create_app(
                 become_prompt()
             audio.start()
             tasks = [
-                asyncio.create_task(_become_ready(host, compiling)),
+                asyncio.create_task(_become_ready(host, compiling, folder)),
                 asyncio.create_task(host.readiness.watch.run()),
                 asyncio.create_task(host.admission.run()),
             ]
@@ -173,7 +177,7 @@ def _turn_away(scope: Scope) -> Response | None:
     return host.turn_away()
 
 
-async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
+async def _become_ready(host: StreamHost, compiler: CompilingProcess, folder: BundleFolder | None) -> None:
     progress = asyncio.create_task(tell_while_compiling())
     try:
         await run_in_own_thread(partial(_warm_up, host, compiler), "nafir-warm-up")
@@ -186,7 +190,33 @@ async def _become_ready(host: StreamHost, compiler: CompilingProcess) -> None:
     collect_rarely()
     host.readiness.warm_up = "done"
     _logger.info("ready: %s", ", ".join(host.scenes))
-    # Nothing waits for these measurements, so clients that already wait are served first.
+    async with asyncio.TaskGroup() as group:
+        group.create_task(_prepare_the_rest(host))
+        if folder is not None:
+            group.create_task(_follow(host, folder))
+
+
+async def _follow(host: StreamHost, folder: BundleFolder) -> None:
+    """Offer what the folder of bundles has, as it changes."""
+    while True:
+        await asyncio.sleep(host.settings.bundle_folder_s)
+        try:
+            changes = await run_in_own_thread(folder.look, "nafir-bundles")
+            host.refused_bundles = folder.refused
+            for scene in changes.gone:
+                host.drop(scene)
+                _logger.info("dropped: %s", scene)
+            for scene, levels in changes.loaded.items():
+                _offer(host, await run_in_own_thread(partial(_prepared, host, levels), "nafir-bundles"))
+                _logger.info("loaded: %s, from %s", scene, levels.bundle.folder)
+            if changes:
+                await _prepare_the_rest(host)
+        except Exception:  # the scenes that there are go on
+            _logger.exception("a change of the folder of bundles could not be followed")
+
+
+async def _prepare_the_rest(host: StreamHost) -> None:
+    """Measure and design what nothing waits for: clients that already wait are served first."""
     await asyncio.sleep(_COSTS_AFTER_S)
     duty_cycle = DutyCycle(_COSTS_SHARE, is_idle=lambda: host.streams == 0)
     later = (
@@ -207,7 +237,7 @@ def _prepare_decoders(host: StreamHost, duty_cycle: DutyCycle) -> None:
     """Design the decoders by which each head hears buses, and pages the reverberation of scenes that know directions.
     Without this the first stream or page to need one would wait for a second."""
     become_background()
-    for levels in host.scenes.values():
+    for levels in tuple(host.scenes.values()):
         orders = {*levels.buses}
         if levels.bundle.manifest.fields and levels.knows_directions:
             orders.add(_PAGE_ORDER)
@@ -222,7 +252,9 @@ def _prepare_decoders(host: StreamHost, duty_cycle: DutyCycle) -> None:
 def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
     """Measure what effects cost on this host. Plans have no costs until then."""
     become_background()
-    for scene, levels in host.scenes.items():
+    for scene, levels in tuple(host.scenes.items()):
+        if scene in host.effect_costs:
+            continue
         try:
             costs = {bus: measure_costs(field, rest=duty_cycle.rest) for bus, field in levels.by_bus.items()}
             host.effect_costs[scene] = costs
@@ -239,29 +271,55 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
         compile_rendering()
         compiler.wait()  # all else is on disk then
         warm_up(get_args(BlockSize))
-        for scene, levels in host.scenes.items():
-            host.places[scene] = place_of_field(levels.default)
         clips_of = dict(zip(host.clips, playable, strict=True))  # before times are measured
-    for scene, levels in host.scenes.items():
-        filters = host.hrtfs.filters(DEFAULT_HRTF, levels.default.sample_rate)
-        offer = host.offers[scene] = Offer(
-            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, poses=_CALIBRATION_POSES)
-        )
-        host.render_costs[scene, levels.own_rate] = measure_rendering(levels, filters)
+    for scene, levels in tuple(host.scenes.items()):
+        _offer(host, _measured(host, levels))
         if levels.knows_directions:
             host.measure(scene, levels.with_directions(), _PAGE_ORDER)
         clips = clips_of[scene]
-        hello = Hello(protocol=PROTOCOL, scene=scene)
-        best, *_, cheapest = offer.steps(AUTO, block_s=hello.block_size / levels.default.sample_rate)
-        if (kind := host.kind_of(hello, levels)) is not None:
-            host.admission.offer(kind, cheapest)
-        session = Session(hello, levels, filters, host.clips[scene].load, quality=best, window=100)
-        start = levels.bundle.manifest.start
-        clip = clips[0].name if clips else None
-        session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))
-        for turn in range(1, 9):
-            session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
-            if (request := session.take_request()) is not None:
-                session.accept(compute_irs(levels, request, session.renderer))
-            session.render_block()
+        _play(host, levels, clips[0].name if clips else None)
     fingerprint()
+
+
+def _measured(host: StreamHost, levels: FieldsByLevel) -> MeasuredScene:
+    """A scene with how long this host takes for a response of each level, and for rendering."""
+    filters = host.hrtfs.filters(DEFAULT_HRTF, levels.own_rate)
+    return MeasuredScene(
+        levels,
+        clips=next(iter(host.clips.values())).at_rate(levels.own_rate),
+        place=place_of_field(levels.default),
+        offer=Offer(
+            tuple(levels[name].level for name in levels.names), calibrate(levels, filters, poses=_CALIBRATION_POSES)
+        ),
+        render_costs=measure_rendering(levels, filters),
+    )
+
+
+def _prepared(host: StreamHost, levels: FieldsByLevel) -> MeasuredScene:
+    """The same for a scene that comes while streams are served."""
+    become_background()
+    return _measured(host, levels)
+
+
+def _offer(host: StreamHost, scene: MeasuredScene) -> None:
+    """Offer a scene, and let admission know the cheapest stream of it."""
+    host.take(scene)
+    hello = Hello(protocol=PROTOCOL, scene=scene.levels.bundle.id)
+    *_, cheapest = scene.offer.steps(AUTO, block_s=hello.block_size / scene.levels.own_rate)
+    if (kind := host.kind_of(hello, scene.levels)) is not None:
+        host.admission.offer(kind, cheapest)
+
+
+def _play(host: StreamHost, levels: FieldsByLevel, clip: str | None) -> None:
+    """Render some blocks of a scene."""
+    hello = Hello(protocol=PROTOCOL, scene=levels.bundle.id)
+    best = host.offers[hello.scene].steps(AUTO, block_s=hello.block_size / levels.own_rate)[0]
+    filters = host.hrtfs.filters(DEFAULT_HRTF, levels.own_rate)
+    session = Session(hello, levels, filters, host.clips[hello.scene].load, quality=best, window=100)
+    start = levels.bundle.manifest.start
+    session.receive(AddEmitter(id="warm-up", clip=clip, live=clip is None, position=start.emitter))
+    for turn in range(1, 9):
+        session.receive(ListenerPose(pose_id=turn, position=start.listener, yaw=0.1 * turn))
+        if (request := session.take_request()) is not None:
+            session.accept(compute_irs(levels, request, session.renderer))
+        session.render_block()

@@ -140,13 +140,24 @@ async def _end_of_access(access: Access, caller: Caller) -> Goodbye:
     return _ENDINGS[await access.ended(caller)]
 
 
+@dataclass(frozen=True)
+class MeasuredScene:
+    """A scene that can be offered: its levels, its clips, its acoustics, and what it costs on this host."""
+
+    levels: FieldsByLevel
+    clips: ClipLibrary
+    place: SceneAcoustics
+    offer: Offer
+    render_costs: Mapping[str, RenderCost]
+
+
 @dataclass
 class StreamHost:
     """State that all connections share: loaded scenes, clips, heads, the audio engine and the number of streams.
     `offers` has the cost of each scene's quality levels on this host once it is measured."""
 
-    scenes: Mapping[str, FieldsByLevel]
-    clips: Mapping[str, ClipLibrary]
+    scenes: dict[str, FieldsByLevel]
+    clips: dict[str, ClipLibrary]
     """Clip libraries by scene; each has the scene's sample rate, and one for each other rate of streams."""
     hrtfs: HrtfLibrary
     audio: AudioEngine
@@ -167,6 +178,8 @@ class StreamHost:
     """Costs of effects by scene, once they are measured, for each order of its levels' buses and without one (None)."""
     render_costs: dict[tuple[str, int], Mapping[str, RenderCost]] = dataclasses.field(default_factory=dict)
     """Costs of rendering by scene and sample rate, and quality level, once they are measured."""
+    refused_bundles: int = 0
+    """Bundles of the folder that is watched which cannot be loaded."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
     admission: Admission = dataclasses.field(init=False)
@@ -207,6 +220,29 @@ class StreamHost:
         error = refusal.error
         return problem(503, error.code, str(error), retry_after_s=error.retry_after_s)
 
+    def take(self, scene: "MeasuredScene") -> None:
+        """Offer a scene from now on, in place of any other with its id. Streams that are open keep theirs."""
+        levels = scene.levels
+        name, rate = levels.bundle.id, levels.own_rate
+        self._forget_costs(name)
+        self.hrtfs.offer(rate)
+        self.clips[name] = scene.clips
+        self.places[name] = scene.place
+        self.offers[name] = scene.offer
+        self.render_costs[name, rate] = scene.render_costs
+        self.scenes[name] = levels
+
+    def drop(self, scene: str) -> None:
+        """Offer a scene no longer. Streams of it go on, with its clips."""
+        self.scenes.pop(scene, None)
+        self.offers.pop(scene, None)
+        self._forget_costs(scene)
+
+    def _forget_costs(self, scene: str) -> None:
+        self.effect_costs.pop(scene, None)
+        self.other_offers = {key: offer for key, offer in self.other_offers.items() if key[0] != scene}
+        self.render_costs = {key: costs for key, costs in self.render_costs.items() if key[0] != scene}
+
     def measure(self, scene: str, levels: FieldsByLevel, order: int | None) -> Offer:
         """Measure what responses of a scene's levels cost on this host at their sample rate, ambisonic ones with an
         `order`; and what rendering at that rate costs. Keep the results. This is work for another thread."""
@@ -215,7 +251,7 @@ class StreamHost:
         if offer is None:
             head = self.head(DEFAULT_HRTF, levels)
             if (scene, rate) not in self.render_costs:
-                whole = self.scenes[scene].at_rate(rate)
+                whole = self.scenes.get(scene, levels).at_rate(rate)
                 self.render_costs[scene, rate] = measure_rendering(whole, *head)
             offered = tuple(levels[name].level for name in levels.names)
             offer = Offer(offered, calibrate(levels, *head, order=order))

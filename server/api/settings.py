@@ -101,6 +101,11 @@ class Settings(BaseSettings):
     """Scene bundles to serve besides those that come with the package."""
     offer_bundles: bool = True
     """Whether clients may read the files of scene bundles, trained fields included, to compute responses themselves."""
+    bundle_folder: Path | None = None
+    """Folder whose sub-folders are scene bundles too. Bundles that come, change or go are loaded, replaced or dropped
+    while the server runs; streams that are open finish with what they have."""
+    bundle_folder_s: Annotated[float, Field(ge=0.1)] = 5.0
+    """Seconds between two looks at `bundle_folder`. What has changed is loaded at the look after."""
     clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, besides those that come with the package."""
     hrtfs: NamedFiles = ()

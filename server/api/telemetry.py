@@ -43,6 +43,9 @@ class Host(Protocol):
     def offers(self) -> Mapping[str, Offer]: ...
 
     @property
+    def refused_bundles(self) -> int: ...
+
+    @property
     def ledger(self) -> StreamLedger: ...
 
     @property
@@ -94,6 +97,11 @@ class ServerCollector(Collector):
         yield from _admission(self._host.admission)
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
+        yield GaugeMetricFamily(
+            "nafir_bundles_refused",
+            "Scene bundles of `bundle_folder` that cannot be loaded; the log says why.",
+            value=self._host.refused_bundles,
+        )
 
     def _audio_threads(self) -> Iterator[Metric]:
         streams = GaugeMetricFamily("nafir_audio_thread_streams", "Open streams of an audio thread.", labels=["thread"])

@@ -39,6 +39,10 @@ class HrtfLibrary:
             for rate in rates:
                 self._filters[name, rate] = self._prepared(name, rate)
 
+    def offer(self, sample_rate: int) -> None:
+        """Add a rate to `sample_rates`, for a scene that has come later. Its filters are made when first asked for."""
+        self.sample_rates = tuple(sorted({*self.sample_rates, sample_rate}))
+
     def require(self, name: str) -> None:
         """Raises RequestError unknown_hrtf for a name that is not among `names`."""
         if name not in self.names:

@@ -30,6 +30,7 @@ class Clips:
 class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
+        self.refused_bundles = 0
         self.ledger = StreamLedger()
         self.admission = Admission(audio, most_streams=1, cores=2)
         self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")

@@ -134,6 +134,7 @@ class Host:
         self.readiness = Readiness(Drain(8.0), ThreadWatch((self.audio,)), warm_up="done")
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}
+        self.refused_bundles = 0
 
 
 def test_every_metric_is_listed(page: Page) -> None:
