@@ -375,13 +375,17 @@ class Connection:
 
     async def _require_offer(self, hello: Hello) -> tuple[FieldsByLevel, Offer | None]:
         """The levels that a hello may have, and their costs; None for these if the client has gone meanwhile. Raises
-        RequestError for a scene or an output that there is not."""
+        RequestError for a scene, an output, a sample rate or a head that there is not."""
         levels = self._host.scenes.get(hello.scene)
         if levels is None:
             raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
         levels = levels.at_rate(hello.sample_rate)
         if hello.ambisonic_order is not None:
             levels = levels.with_directions(hello.level)
+        if levels.default.sample_rate != levels.own_rate:
+            # Not within an opening, for which others wait: a large head takes many seconds when a rate is first used.
+            for head in {DEFAULT_HRTF, hello.hrtf or DEFAULT_HRTF}:
+                await asyncio.to_thread(self._host.head, head, levels)
         return levels, await self._offer(hello, levels)
 
     def _steps(

@@ -35,8 +35,9 @@ class Socket:
         self.incoming, self.sent, self.reads = asyncio.Queue(), [], asyncio.Event()
         self.has_sent, self.close_code = asyncio.Event(), None
         self.reads.set()
+        self.scope = {"type": "websocket"}
 
-    async def accept(self):
+    async def accept(self, subprotocol=None):
         pass
 
     async def receive(self):

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 import soundfile
+import soxr
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
@@ -26,6 +27,7 @@ from server.protocol.server_messages import (
     Welcome,
     parse_server_message,
 )
+from server.scene.effects import EffectName
 from tests.directional_flat import write_directional
 
 pytestmark = pytest.mark.timed
@@ -41,7 +43,12 @@ def clip_files(tmp_path_factory):
     soundfile.write(tone, np.sin(np.arange(24_000) * 0.1) / 4, 24_000)
     broken = folder / "broken.wav"
     broken.write_bytes(b"RIFF but not really")
-    return tone, broken
+    noise = folder / "noise.wav"
+    spectrum = np.fft.rfft(np.random.default_rng(5).standard_normal(24_000) / 8)
+    frequency = np.fft.rfftfreq(24_000, 1 / 48_000)
+    samples = np.fft.irfft(spectrum * ((frequency > 100) & (frequency < 10_000))) * np.hanning(24_000)
+    soundfile.write(noise, samples, 48_000, subtype="FLOAT")
+    return tone, broken, noise
 
 
 @contextmanager
@@ -213,6 +220,34 @@ def test_a_stream_at_another_rate_than_the_scenes_plays_clips_at_their_pitch(cli
         samples = np.concatenate([block.samples[0] for block in blocks])
         spectrum = np.abs(np.fft.rfft(samples * np.hanning(samples.size), 8 * rate))
         assert np.argmax(spectrum) / 8 == pytest.approx(0.1 * 24_000 / (2 * np.pi), abs=0.3)
+
+
+def test_streams_of_every_rate_and_encoding_agree(client, clip_files):
+    clip = AddEmitter(id="a", clip=clip_files[2].stem, position=(6.0, 3.0, 1.5), loop=False)
+    every = dict.fromkeys(EffectName, True)
+
+    def heard(rate, encoding):
+        """(n,) half a second of the left ear from the moment when the clip begins, whatever the plan says."""
+        hello = HELLO.model_copy(
+            update={"sample_rate": rate, "encoding": encoding, "block_size": 512, "effects": every}
+        )
+        with client.websocket_connect("/v1/stream") as socket:
+            ears = Ears(socket, hello)
+            ears.send(clip)
+            begins = ears.until(EmitterAdded).sample_clock
+            blocks = [ears.until(AudioBlock, lambda block: block.sample_clock >= begins)]
+            blocks += [ears.until(AudioBlock) for _ in range(rate // 2 // 512)]
+        assert blocks[0].sample_clock == begins
+        return np.concatenate([block.samples[0] for block in blocks])[: rate // 2].astype(float)
+
+    def signal_to_noise_db(actual, expected):
+        return 10 * np.log10(np.sum(expected**2) / (np.sum((actual - expected) ** 2) + 1e-30))
+
+    own = heard(24_000, "f32")
+    for rate in (24_000, 44_100, 48_000, 96_000):
+        exact, rounded = (heard(rate, encoding) for encoding in ("f32", "s16"))
+        assert signal_to_noise_db(rounded, exact) > 50  # at some -40 dB of full scale
+        assert signal_to_noise_db(soxr.resample(exact, rate, 24_000, quality="VHQ"), own) > 40
 
 
 def test_a_stream_of_two_ears_has_no_order(client):

@@ -10,7 +10,7 @@ from server.rendering.head_decoder import HeadDecoder
 from server.rendering.hrtf import kemar
 
 BINS = 1025
-RATES = (24_000, 48_000)
+RATES = (24_000, 48_000, 96_000)
 DIRECTIONS = even_directions(400)
 
 
