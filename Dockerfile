@@ -27,6 +27,10 @@ FROM ${BASE}
 LABEL org.opencontainers.image.title="Nafir" \
       org.opencontainers.image.description="A real-time neural acoustic field renderer" \
       org.opencontainers.image.licenses="MIT"
+# For streams in Opus; without it they are refused.
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libopus0 \
+    && rm -rf /var/lib/apt/lists/*
 COPY --from=builder /opt/nafir /opt/nafir
 ENV PATH=/opt/nafir/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \

@@ -46,6 +46,7 @@ from server.runtime.own_thread import run_in_own_thread
 from server.runtime.pace import CpuBudget
 from server.runtime.priority import DutyCycle, become_background, become_prompt
 from server.runtime.readiness import Readiness
+from server.runtime.thread_pool import ThreadPool
 from server.runtime.thread_watch import ThreadWatch
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
@@ -59,6 +60,11 @@ _CALIBRATION_POSES = 3
 _COSTS_AFTER_S = 5.0
 _COSTS_SHARE = 0.05
 """Share of a core that the measurement of effects' costs may take while there are streams."""
+_ENCODERS = 2
+"""Threads that encode in Opus. One is enough for some 250 streams of two channels, or 30 of third-order ambisonics."""
+_ENCODER_PATIENCE_S = 10.0
+"""Time for the blocks of a tick of one stream, which take milliseconds to encode."""
+_ENCODER_STOP_S = 1.0
 _PAGE_ORDER = ORDERS[0]
 """The order of the ambisonics that the page asks for."""
 WEB = Path(__file__).parents[1] / "web"
@@ -118,6 +124,9 @@ def create_app(
                 is_real_time=settings.realtime,
                 thresholds=dataclasses.replace(THRESHOLDS, ir_share=settings.ir_share),
             )
+            encoders = ThreadPool(
+                min(_ENCODERS, settings.audio_threads), "nafir-encoder", patience_s=_ENCODER_PATIENCE_S
+            )
             host = StreamHost(
                 scenes=loaded,
                 clips=open_clips(loaded, settings.clips),
@@ -125,7 +134,8 @@ def create_app(
                 audio=audio,
                 settings=settings,
                 responses=responses,
-                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool))),
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool, encoders))),
+                encoders=encoders,
                 peers=peers,
                 access=access,
             )
@@ -146,6 +156,7 @@ def create_app(
                 for task in tasks:
                     task.cancel()
                 await asyncio.to_thread(audio.stop)
+                await asyncio.to_thread(encoders.stop, _ENCODER_STOP_S)
                 collect_as_usual()
 
     app = FastAPI(

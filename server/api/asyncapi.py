@@ -19,7 +19,7 @@ from server.api.inflow import MOVES_PER_S, POSES_PER_S
 from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
-from server.protocol.codecs.registry import CODECS
+from server.protocol.codecs.registry import CODECS, OPUS_MEANING
 from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
@@ -53,7 +53,8 @@ def _description() -> str:
     exchange = "\n".join(
         f"1. {'client' if step.is_of_client else 'server'}, `{step.name}`: {step.meaning}" for step in EXCHANGE
     )
-    encodings = ", ".join(f"{name} is {codec.meaning}" for name, codec in CODECS.items())
+    meanings = {name: codec.meaning for name, codec in CODECS.items()} | {"opus": OPUS_MEANING}
+    encodings = ", ".join(f"{name} is {meaning}" for name, meaning in meanings.items())
     return f"""Live audio from a scene in which a listener and emitters move. Protocol version {PROTOCOL}.
 
 Control messages are JSON text, one object with a `type` each. Audio is sent in binary messages, and listener poses may
@@ -86,6 +87,16 @@ listener's head: W is what an omnidirectional microphone hears there. The client
 listener's orientation and decodes them. So a turn is heard as soon as the client likes, changes nothing in the blocks
 and asks for no response; positions count as ever. Only scenes and levels whose fields predict directions can do it, and
 scenes without a field: others refuse the `hello` (`no_directions`).
+
+**Opus.** With `"encoding": "opus"` blocks hold packets of Opus in place of samples, and `opus` in the `hello` may say
+how to encode. `GET /v1/encodings` says whether a server has Opus, and at which sample rates; others refuse the `hello`
+(`unsupported_encoding`). The `welcome` has `opus`: the `streams`, each of two channels or of one (ambisonics take one
+for each pair of channels), the samples of a packet, and the `look_ahead`. A packet lasts 5, 10 or 20 ms and a block as
+long as it likes, so a block holds the packets that its samples have completed: for each, the packet of every stream in
+turn, and none if its samples complete none. Keep a decoder for each stream, give it its packets in order, and begin
+anew with every block that has `is_restart`: new decoders, whose first `look_ahead` samples are dropped. What remains is
+heard from `sample_clock` on, and there are `frames` of it; so samples of an Opus stream and of another have the same
+clock. Live input may be in Opus too, whatever the encoding of the stream.
 
 **Flow control by acknowledgement.** At most `window` blocks (see `welcome`) are sent without an `acknowledge`. One
 `acknowledge` stands for all earlier blocks, so every fourth block or so is enough. While the window is full, blocks are

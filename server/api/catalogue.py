@@ -4,12 +4,15 @@ import logging
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from server.assets.clips import Clip, ClipLibrary, DecodeError
 from server.assets.hrtfs import HrtfLibrary
 from server.assets.names import named_by_stem
 from server.core.errors import BundleError
 from server.field.fields_by_level import FieldsByLevel
+from server.protocol.codecs import libopus
+from server.protocol.codecs.registry import CODECS, OPUS_MEANING
 from server.protocol.server_messages import Place, SceneDescription
 from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
 
@@ -46,6 +49,16 @@ def open_clips(scenes: Mapping[str, FieldsByLevel], files: Iterable[Path]) -> di
     rates = {scene: levels.default.sample_rate for scene, levels in scenes.items()}
     by_rate = {rate: ClipLibrary(rate, named) for rate in set(rates.values())}
     return {scene: by_rate[rate] for scene, rate in rates.items()}
+
+
+def describe_encodings() -> list[dict[str, Any]]:
+    """Encodings of the live stream, by name, each with the sample rates that it has; None where it has any."""
+    described: list[dict[str, Any]] = [
+        {"name": name, "meaning": codec.meaning, "sample_rates": None} for name, codec in CODECS.items()
+    ]
+    if libopus.is_available():
+        described.append({"name": "opus", "meaning": OPUS_MEANING, "sample_rates": libopus.RATES})
+    return described
 
 
 def playable_clips(clips: ClipLibrary) -> list[Clip]:

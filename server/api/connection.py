@@ -29,6 +29,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
+from server.api.block_encoding import BlockEncoding
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
 from server.api.problems import problem
@@ -45,6 +46,7 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
 from server.planning.scene_acoustics import SceneAcoustics
+from server.protocol.blocks import DryPackets
 from server.protocol.client_messages import (
     AUTO,
     PROTOCOL,
@@ -58,7 +60,7 @@ from server.protocol.client_messages import (
     emitter_of,
     parse_client_message,
 )
-from server.protocol.codecs.registry import Encoding
+from server.protocol.codecs.registry import SampleEncoding, is_of_samples, require_encoding
 from server.protocol.codes import (
     ACCESS_ENDED,
     INTERNAL_ERROR,
@@ -67,11 +69,14 @@ from server.protocol.codes import (
     SERVICE_RESTART,
     TRY_AGAIN_LATER,
 )
+from server.protocol.opus import OpusOptions
+from server.protocol.packets import BlockEncoder, LiveDecoders
 from server.protocol.server_messages import EmitterEnded, Error, Pong, ServerMessage, Welcome
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
+from server.runtime.thread_pool import ThreadPool
 from server.streaming.admission import Admission, Place, Refusal
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
@@ -164,6 +169,8 @@ class StreamHost:
     settings: Settings
     responses: ResponseCache
     readiness: Readiness
+    encoders: ThreadPool
+    """The threads that encode blocks in encodings that take their time."""
     peers: ProcessPeers | None = None
     """The processes that serve at one port, if this is one of them."""
     access: Access | None = None
@@ -296,7 +303,10 @@ class Connection:
         self._is_overfull = asyncio.Event()
         self._stream: Stream | None = None
         self._place: Place | None = None
-        self._encoding: Encoding = "f32"
+        self._encoding: SampleEncoding = "f32"
+        """How blocks without packets are sent."""
+        self._block_encoding: BlockEncoding | None = None
+        self._live_decoders: LiveDecoders | None = None
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
@@ -380,6 +390,7 @@ class Connection:
         if levels is None:
             raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
         levels = levels.at_rate(hello.sample_rate)
+        require_encoding(hello.encoding, levels.default.sample_rate)
         if hello.ambisonic_order is not None:
             levels = levels.with_directions(hello.level)
         if levels.default.sample_rate != levels.own_rate:
@@ -411,6 +422,20 @@ class Connection:
             return _refused(refusal)
         if session is None:
             return None
+        encoder = None
+        if is_of_samples(hello.encoding):
+            self._encoding = hello.encoding
+        else:
+            options = OpusOptions() if hello.opus is None else hello.opus
+            encoder = BlockEncoder(options, channels=session.renderer.outputs, sample_rate=field.sample_rate)
+            self._block_encoding = BlockEncoding(
+                encoder,
+                self._host.encoders,
+                capacity=self._capacity,
+                post=asyncio.get_running_loop().call_soon_threadsafe,
+                deliver=self._send_or_queue,
+            )
+        self._live_decoders = LiveDecoders(field.sample_rate, settings.max_emitters)
         await self._send_message(
             Welcome(
                 session=uuid.uuid4().hex,
@@ -426,6 +451,7 @@ class Connection:
                 level=ladder.step.level,
                 max_emitters=self._host.settings.max_emitters,
                 order=hello.ambisonic_order,
+                opus=None if encoder is None else encoder.streams,
             )
         )
         return Stream(
@@ -483,7 +509,7 @@ class Connection:
 
     async def _pump(self, stream: Stream, hello: Hello, place: Place) -> Goodbye | None:
         """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
-        self._stream, self._place, self._encoding = stream, place, hello.encoding
+        self._stream, self._place = stream, place
         self._host.ledger.open(stream)
         self._host.audio.open(stream)
         tasks = [
@@ -555,7 +581,11 @@ class Connection:
         server_busy for what has no room."""
         if isinstance(message, Ping):
             self._enqueue([Pong(id=message.id)])
-        elif not stream.offer(self._admitted(message, stream)):
+            return
+        if isinstance(message, DryPackets):
+            assert self._live_decoders is not None
+            message = self._live_decoders.decode(message)
+        if not stream.offer(self._admitted(message, stream)):
             raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
 
     def _admitted(self, message: ClientMessage, stream: Stream) -> ClientMessage | ChosenSteps:
@@ -569,6 +599,8 @@ class Connection:
                 refusal = admission.add_emitter(place, is_live=message.live)
             case RemoveEmitter():
                 admission.remove_emitter(place)
+                if self._live_decoders is not None:
+                    self._live_decoders.forget(message.id)
             case SetEffects() if any(message.effects.values()) or message.output not in {None, "mono"}:
                 refusal = admission.add_effects(place)
             case SetLevel():
@@ -595,7 +627,14 @@ class Connection:
         return parse_client_message(data)
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
-        """Send the audio thread's output: blocks at once if there is a fast path and nothing waits to be sent."""
+        """Send the audio thread's output, once it is encoded."""
+        if self._block_encoding is None:
+            self._send_or_queue(outgoing)
+        elif not self._block_encoding.put(outgoing):
+            self._is_overfull.set()
+
+    def _send_or_queue(self, outgoing: list[Outgoing]) -> None:
+        """Send output: blocks at once if there is a fast path and nothing waits to be sent."""
         if self._stream is None or self._place is None:
             return  # rendered before the audio thread knew that the connection ends
         for each in outgoing:
@@ -654,7 +693,7 @@ class Connection:
         if stream is not None and stream.note_sent(timed.deadline_s, now_s) and not block.is_late:
             stream.blocks_late += 1
             block.is_late = True
-        return block.serialize(self._encoding)
+        return block.serialize(self._encoding) if timed.packets is None else block.serialize_packets(timed.packets)
 
     async def _send_message(self, message: ServerMessage) -> None:
         await self._websocket.send_text(message.serialize())

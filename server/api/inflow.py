@@ -18,7 +18,9 @@ from typing import Final, Self
 
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import ListenerPose
-from server.protocol.codecs.registry import CODECS
+from server.protocol.codecs.libopus import RATES
+from server.protocol.codecs.registry import CODECS, NUMBERS
+from server.protocol.packets import LONGEST_LIVE_S
 
 SUPERSEDED_COST: Final = 1 / 8
 READ_COST: Final = 1 / 4
@@ -26,6 +28,9 @@ READ_COST: Final = 1 / 4
 OTHER_FRAME_COST: Final = 2.0
 """Cost of a frame that is not a whole message (a ping, a fragment), which uvicorn's slower path handles."""
 _LIVE_COST: Final = 1 / 2
+_OPUS_FRAMES: Final = 240
+"""Samples in Opus that are decoded, and as many filled in, in the time of a unit."""
+_MOST_FRAMES: Final = round(LONGEST_LIVE_S * max(RATES))
 _SHORTEST_BLOCK: Final = 128
 POSES_PER_S = 1_000
 MOVES_PER_S = 120
@@ -88,7 +93,13 @@ class Budget:
 
 def message_cost(message: bytes, *, is_text: bool) -> float:
     """Cost of a whole message."""
-    return _LIVE_COST if not is_text and message[:1] == bytes([DryBlock.KIND]) else 1.0
+    if is_text or message[:1] != _LIVE_KIND:
+        return 1.0
+    if message[1:2] != _OPUS_NUMBER:
+        return _LIVE_COST
+    # A block that does not last as long as it says is refused before it is decoded.
+    frames = min(int.from_bytes(message[_FRAMES], "little"), _MOST_FRAMES)
+    return _LIVE_COST + frames / _OPUS_FRAMES
 
 
 def supersedes(newer: bytes, older: bytes) -> bool:
@@ -98,6 +109,9 @@ def supersedes(newer: bytes, older: bytes) -> bool:
     return newer_id is not None and older_id is not None and newer_id > older_id
 
 
+_LIVE_KIND: Final = bytes([DryBlock.KIND])
+_OPUS_NUMBER: Final = bytes([NUMBERS["opus"]])
+_FRAMES: Final = slice(8, 12)  # of DryBlock.LAYOUT
 _BINARY_KIND: Final = bytes([ListenerPose.KIND])
 _ID = slice(4, 8)  # of ListenerPose.LAYOUT
 _TEXT_POSE: Final = re.compile(rb'"type"\s*:\s*"listener"\s*[,}]')

@@ -18,7 +18,7 @@ from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.api.access_gate import caller_of
 from server.api.asyncapi import document
 from server.api.bundle_files import BundleFiles
-from server.api.catalogue import describe_scene, playable_clips
+from server.api.catalogue import describe_encodings, describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
 from server.api.process_peers import OWN_METRICS
@@ -407,6 +407,12 @@ async def clips(request: Request) -> dict[str, Any]:
         for clip in await anyio.to_thread.run_sync(playable_clips, library):
             named[clip.name] = clip
     return {"clips": [named[name] for name in sorted(named)]}
+
+
+@api.get("/encodings")
+async def encodings() -> dict[str, Any]:
+    """Encodings of the live stream that this server has, and at which sample rates (null: at any)."""
+    return {"encodings": describe_encodings()}
 
 
 @api.get("/hrtfs")

@@ -45,7 +45,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from server.bench.meter import Thread
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
-from server.protocol.codecs.registry import CODECS, Encoding
+from server.protocol.codecs.registry import CODECS, SampleEncoding
 from server.streaming.audio_engine import PHASES
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.plan_audit import SHARE_OF_ALL
@@ -335,7 +335,7 @@ def _most(fits: Callable[[int], bool]) -> int:
     return good
 
 
-def down_bits_per_s(encoding: Encoding, *, blocks_per_s: float, block_size: int, channels: int = 2) -> float:
+def down_bits_per_s(encoding: SampleEncoding, *, blocks_per_s: float, block_size: int, channels: int = 2) -> float:
     """Bits per second from the server to a listener, with all headers, each block in packets of its own."""
     payload = AudioBlock.HEADER_BYTES + _FRAME_BYTES + channels * block_size * CODECS[encoding].bytes_per_sample
     return 8 * blocks_per_s * (payload + _PACKET_BYTES * math.ceil(payload / _SEGMENT_BYTES))
@@ -378,14 +378,14 @@ class Sizing:
     cores_lowest: int
     machines: int
     memory_bytes: float
-    down_bits_per_s: Mapping[Encoding, float]
+    down_bits_per_s: Mapping[SampleEncoding, float]
     up_bits_per_s: float
     breaks_first: str
     """The part of a machine that is full first: more of it, and a machine bears more listeners."""
 
 
 def limits(
-    model: Model, machine: Machine, emitters: int, *, encoding: Encoding = "f32", scenes: int = 1
+    model: Model, machine: Machine, emitters: int, *, encoding: SampleEncoding = "f32", scenes: int = 1
 ) -> tuple[Limit, ...]:
     """How many listeners at the best quality each part of a machine bears, the part that breaks first at the front.
     Parts that do not grow with listeners, such as bundles, are taken off first."""
@@ -443,7 +443,7 @@ def limits(
 
 
 def size(
-    model: Model, machine: Machine, listeners: int, emitters: int, *, encoding: Encoding = "f32", scenes: int = 1
+    model: Model, machine: Machine, listeners: int, emitters: int, *, encoding: SampleEncoding = "f32", scenes: int = 1
 ) -> Sizing:
     """What so many listeners need. A machine that bears none of them counts as none: `machines` is then 0."""
     first = limits(model, machine, emitters, encoding=encoding, scenes=scenes)[0]

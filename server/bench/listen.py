@@ -11,8 +11,8 @@ from websockets.asyncio.client import connect
 from server.acoustics.geometry import Vector3
 from server.assets.clips import ClipLibrary
 from server.core.errors import NafirError
-from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose
+from server.protocol.packets import BlockReader
 from server.protocol.server_messages import Error, Welcome, parse_server_message
 
 _TURN_S = 12.0
@@ -49,6 +49,7 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
         answer = parse_server_message(str(await socket.recv()))
         if not isinstance(answer, Welcome):
             raise NafirError(f"{url} does not serve {scene}: {answer.serialize()}")
+        reader = BlockReader(answer)
         for emitter in _sounding(answer, emitters):
             await socket.send(emitter.serialize())
         blocks = blocks_skipped = exchanges = pose_id = next_clock = 0
@@ -63,7 +64,7 @@ async def listen(url: str, scene: str, emitters: int, duration_s: float, poses_p
                 event = parse_server_message(message)
                 errors += [event.code] if isinstance(event, Error) else []
                 continue
-            block = AudioBlock.parse(message, answer.encoding)
+            block = reader.read(message)
             blocks += 1
             blocks_skipped += (block.sample_clock - next_clock) // answer.block_size
             next_clock = block.sample_clock + answer.block_size

@@ -33,10 +33,11 @@ from server.core.errors import RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.near_names import suggestion
 from server.planning.scene_acoustics import Output
-from server.protocol.blocks import DryBlock
+from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.codecs.registry import Encoding
 from server.protocol.layout import Layout
 from server.protocol.message import WHOLE, Integer, Message, Position
+from server.protocol.opus import OpusOptions
 
 PROTOCOL: Final = 3
 AUTO = "auto"
@@ -100,15 +101,16 @@ class ListenerStart(_Directed):
 
 class Hello(Message):
     """The first message asks for a scene and says how it is to be rendered. `sample_rate` is one of the scene's
-    `sample_rates`; without it the stream has the scene's own. `buffer_blocks` is how many blocks ahead of real time the
-    server sends: a higher number copes with a worse network, a lower one has less latency. `hrtf` names a head, one of
-    GET /v1/hrtfs. `level` names a quality level of the scene; with `auto` the server takes the best one that its host
-    computes in time, and a cheaper one under load. `output` says what plays the sound: for a mono loudspeaker, blocks
-    have one channel. With `ambisonics` blocks have the channels of `order` 1 (the default), 2 or 3 in the axes of the
-    scene: ACN order, SN3D norm (AmbiX). The client turns them by its listener's orientation and decodes them; a turn
-    then changes nothing in the blocks. `effects` switches effects on or off, whatever the plan would decide. `emitters`
-    is how many emitters the client is about to add: the server lets the stream in only if they fit, and keeps room for
-    them for some seconds. Without it the server expects as many as other streams have."""
+    `sample_rates`; without it the stream has the scene's own. With the encoding `opus`, `opus` says how to encode.
+    `buffer_blocks` is how many blocks ahead of real time the server sends: a higher number copes with a worse network,
+    a lower one has less latency. `hrtf` names a head, one of GET /v1/hrtfs. `level` names a quality level of the scene;
+    with `auto` the server takes the best one that its host computes in time, and a cheaper one under load. `output`
+    says what plays the sound: for a mono loudspeaker, blocks have one channel. With `ambisonics` blocks have the
+    channels of `order` 1 (the default), 2 or 3 in the axes of the scene: ACN order, SN3D norm (AmbiX). The client turns
+    them by its listener's orientation and decodes them; a turn then changes nothing in the blocks. `effects` switches
+    effects on or off, whatever the plan would decide. `emitters` is how many emitters the client is about to add: the
+    server lets the stream in only if they fit, and keeps room for them for some seconds. Without it the server expects
+    as many as other streams have."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -116,6 +118,7 @@ class Hello(Message):
     sample_rate: Integer | None = None
     block_size: Annotated[BlockSize, WHOLE] = 256
     encoding: Encoding = "f32"
+    opus: OpusOptions | None = None
     listener: ListenerStart | None = None
     hrtf: Annotated[str, Field(max_length=256)] | None = None
     level: LevelName = AUTO
@@ -132,6 +135,13 @@ class Hello(Message):
         if order is not None and info.data.get("output", "ambisonics") != "ambisonics":
             raise PydanticCustomError("malformed_message", "belongs to the output ambisonics")
         return order
+
+    @field_validator("opus")
+    @classmethod
+    def _is_of_opus(cls, options: OpusOptions | None, info: ValidationInfo) -> OpusOptions | None:
+        if options is not None and info.data.get("encoding", "opus") != "opus":
+            raise PydanticCustomError("malformed_message", "belongs to the encoding opus")
+        return options
 
     @property
     def ambisonic_order(self) -> int | None:
@@ -342,7 +352,7 @@ TextMessage = (
     | Acknowledge
     | Ping
 )
-ClientMessage = TextMessage | DryBlock
+ClientMessage = TextMessage | DryBlock | DryPackets
 _FIELDS: Final[Mapping[str, Iterable[str]]] = {
     str(each.model_fields["type"].default): each.model_fields for each in get_args(TextMessage)
 }

@@ -18,6 +18,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "unexpected_hello": "a stream has one hello",
     "unsupported_protocol": "the server speaks another version of the protocol",
     "unsupported_sample_rate": "the scene is not rendered at this sample rate; the message lists those it is",
+    "unsupported_encoding": "the server does not have the encoding, or not at this rate; GET /v1/encodings lists them",
     "unknown_scene": "there is no such scene; GET /v1/scenes lists them",
     "unknown_hrtf": "there is no such head; GET /v1/hrtfs lists them",
     "unknown_level": "the scene has no quality level of this name",

@@ -4,7 +4,7 @@ from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 
-from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.blocks import AudioBlock, DryBlock, DryPackets
 from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
@@ -65,6 +65,8 @@ class Step(NamedTuple):
         match self.message:
             case AudioBlock() | DryBlock() as block:
                 return block.serialize("f32").hex()
+            case DryPackets() as packets:
+                return packets.serialize().hex()
             case ListenerPose() as pose if self.is_binary:
                 return pose.serialize_binary().hex()
             case message:

@@ -10,6 +10,7 @@ from server.planning.plan import Plan
 from server.protocol.client_messages import PROTOCOL
 from server.protocol.codecs.registry import Encoding
 from server.protocol.message import Message, Position
+from server.protocol.opus import OpusStreams
 from server.scene.geometry import Opening
 from server.scene.manifest import AcceptedLaw, Bounds, QualityLevel
 
@@ -56,8 +57,9 @@ class SceneDescription(Message):
 class Welcome(Message):
     """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
     `sample_rate` is that of the stream, `ir_samples` the length of its longest response. `level` is the first quality
-    level. `max_emitters` is how many emitters the stream may have at once. `order` is that
-    of ambisonic channels; streams of other outputs do not have it."""
+    level. `max_emitters` is how many emitters the stream may have at once. `order` is that of ambisonic channels;
+    streams of other outputs do not have it. `opus` says how to decode the encoding `opus`; streams of other encodings
+    do not have it."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[3] = PROTOCOL
@@ -74,6 +76,7 @@ class Welcome(Message):
     level: str
     max_emitters: int | None = None
     order: Annotated[int | None, Field(exclude_if=lambda order: order is None)] = None
+    opus: Annotated[OpusStreams | None, Field(exclude_if=lambda opus: opus is None)] = None
 
 
 class EmitterAdded(Message):
@@ -174,13 +177,15 @@ class Durations(Message):
 
 
 class LiveStatus(Message):
-    """Counts of a live emitter's samples: `samples_queued` wait, `samples_dropped` came while too many waited, and
-    `samples_gated` were not audio and became silence. `underruns` counts how often too few waited."""
+    """Counts of a live emitter's samples: `samples_queued` wait, `samples_dropped` came while too many waited,
+    `samples_gated` were not audio and became silence, and `samples_concealed` stand for blocks in Opus that were lost.
+    `underruns` counts how often too few waited."""
 
     id: str
     samples_queued: int
     samples_dropped: int
     samples_gated: int
+    samples_concealed: int = 0
     underruns: int
 
 

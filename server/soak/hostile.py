@@ -18,7 +18,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from server.core.errors import NafirError
-from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.client_messages import (
     AUTO,
     PROTOCOL,
@@ -33,8 +33,10 @@ from server.protocol.client_messages import (
     SetGain,
     SetLevel,
 )
+from server.protocol.codecs import libopus
 from server.protocol.codecs.codec import FloatArray
-from server.protocol.codecs.registry import CODECS
+from server.protocol.codecs.registry import NUMBERS, is_of_samples
+from server.protocol.packets import BlockReader
 from server.protocol.server_messages import Error, Pong, Welcome, parse_server_message
 from server.scene.effects import EffectName
 
@@ -55,6 +57,7 @@ class Hostile:
     """Runs one hostile connection after another. Counts are sums over all of them."""
 
     def __init__(self, url: str, seed: int) -> None:
+        self._encodings = [name for name in NUMBERS if is_of_samples(name) or libopus.is_available()]
         self.actions: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self.endings: Counter[str] = Counter()
@@ -78,6 +81,8 @@ class Hostile:
             hello = self._hello(scene)
             await socket.send(hello.serialize())
             welcome = parse_server_message(str(await asyncio.wait_for(socket.recv(), _PATIENCE_S)))
+            if isinstance(welcome, Error) and welcome.code == "unsupported_encoding":
+                return  # of a scene at another rate than Opus has
             if not isinstance(welcome, Welcome):
                 raise NafirError(f"{hello.serialize()} was answered by {welcome.serialize()}")
             life = _Life(self, socket, welcome, self._rng)
@@ -103,7 +108,7 @@ class Hostile:
             protocol=PROTOCOL,
             scene=scene,
             block_size=int(rng.choice((128, 256, 512, 1024))),  # type: ignore[arg-type]
-            encoding=list(CODECS)[rng.integers(len(CODECS))],
+            encoding=self._encodings[rng.integers(len(self._encodings))],
             output="mono" if rng.random() < 0.3 else "headphones",
             effects={name.value: bool(rng.integers(2)) for name in EffectName if rng.random() < 0.2},
             buffer_blocks=int(rng.integers(1, 33)),
@@ -117,6 +122,8 @@ class _Life:
         self._client = hostile
         self._socket = socket
         self._welcome = welcome
+        self._reader = BlockReader(welcome)
+        self._speech = _spoken(welcome.sample_rate)
         self._rng = rng
         self._low, self._high = (
             np.array(corner) for corner in (welcome.scene.bounds.minimum, welcome.scene.bounds.maximum)
@@ -133,7 +140,7 @@ class _Life:
         client = self._client
         async for message in self._socket:
             if isinstance(message, bytes):
-                block = AudioBlock.parse(message, self._welcome.encoding)
+                block = self._reader.read(message)
                 client.blocks += 1
                 client.blocks_late += block.is_late
                 client.samples_not_finite += block.samples.size - int(np.count_nonzero(np.isfinite(block.samples)))
@@ -244,6 +251,17 @@ class _Life:
         )
         return self._dry(signals[self._rng.integers(len(signals))].astype(np.float32))
 
+    def live_packets(self) -> list[str | bytes]:
+        """Sends packets of Opus, some of them with gaps before them and some for an emitter that had samples before."""
+        live = [name for name, is_live in self._emitters.items() if is_live]
+        if not live or not self._speech:
+            return []
+        self._dry_sequence += int(self._rng.choice((1, 1, 1, 2, 5, 1_000)))
+        number = int(self._rng.integers(len(self._speech)))
+        packets = self._speech[number : number + int(self._rng.integers(1, 4))]
+        frames = len(packets) * self._welcome.sample_rate // 50
+        return [DryPackets(str(self._rng.choice(live)), self._dry_sequence, frames, packets).serialize()]
+
     def acknowledge_again(self) -> list[str | bytes]:
         return [Acknowledge(sequence=self._newest).serialize()]
 
@@ -294,6 +312,16 @@ class _Life:
     def short_dry_block(self) -> list[str | bytes]:
         return [DryBlock("e1", 0, np.ones(8, np.float32)).serialize("f32")[:-3]]
 
+    def broken_packets(self) -> list[str | bytes]:
+        """Sends packets with lengths that cannot be."""
+        return [DryPackets("e1", 0, 480, (self._rng.bytes(300),)).serialize()[: int(self._rng.integers(17, 300))]]
+
+    def packets_that_are_none(self) -> list[str | bytes]:
+        """Sends packets that say that they hold 63 frames of 20 ms."""
+        self._dry_sequence += 1
+        packet = bytes([0xFB, 0x3F]) + self._rng.bytes(100)
+        return [DryPackets("e1", self._dry_sequence, 480, (packet,)).serialize()]
+
     def second_hello(self) -> list[str | bytes]:
         return [Hello(protocol=PROTOCOL, scene=self._welcome.scene.id).serialize()]
 
@@ -318,6 +346,16 @@ class _Life:
         return self._pose_id
 
 
+def _spoken(sample_rate: int) -> tuple[bytes, ...]:
+    """Half a second of a tone that swells, in packets of 20 ms; none where there is no Opus."""
+    if not libopus.is_available() or sample_rate not in libopus.RATES:
+        return ()
+    encoder = libopus.OpusEncoder(sample_rate=sample_rate, channels=1, application="voip", bitrate=24_000, complexity=0)
+    time_s = np.arange(sample_rate // 2) / sample_rate
+    tone = (time_s * np.sin(2 * np.pi * 300 * time_s)).astype(np.float32).reshape(25, -1, 1)
+    return tuple(encoder.encode(frame) for frame in tone)
+
+
 def _point(position: _Floats) -> tuple[float, float, float]:
     x, y, z = position.tolist()
     return x, y, z
@@ -340,6 +378,7 @@ _TRICKS: Mapping[str, _Trick] = {
         _Life.level,
         _Life.effects,
         _Life.live_sound,
+        _Life.live_packets,
         _Life.acknowledge_again,
     )
 }
@@ -360,6 +399,8 @@ _FAULTS: Mapping[str, _Trick] = {
         _Life.unknown_effect,
         _Life.unknown_clip,
         _Life.short_dry_block,
+        _Life.broken_packets,
+        _Life.packets_that_are_none,
         _Life.second_hello,
     )
 }

@@ -27,8 +27,8 @@ from server.bench.machine import describe_machine
 from server.bench.report import Goal, Judgement
 from server.core.errors import NafirError
 from server.field.fields_by_level import FieldsByLevel
-from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import Acknowledge
+from server.protocol.packets import BlockReader
 from server.protocol.server_messages import EmitterAdded, Welcome, parse_server_message
 from server.scene.bundle import Bundle, find_bundle
 from server.soak.host import Host, serve
@@ -158,6 +158,7 @@ class _Soak:
                 welcome = parse_server_message(str(await socket.recv()))
                 if not isinstance(welcome, Welcome):
                     raise NafirError(f"the witness was refused: {welcome.serialize()}")
+                reader = BlockReader(welcome)
                 await socket.send(witness.emitter.serialize())
                 while not over.is_set():
                     message = await socket.recv()
@@ -166,7 +167,7 @@ class _Soak:
                         if isinstance(event, EmitterAdded):
                             witness.begin(event.sample_clock)
                         continue
-                    block = AudioBlock.parse(message, welcome.encoding)
+                    block = reader.read(message)
                     witness.compare(block)
                     self._blocks += 1
                     self._blocks_late += block.is_late

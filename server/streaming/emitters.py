@@ -186,6 +186,7 @@ class LiveInput:
     id: str
     source: LiveSource
     newest_sequence: int = -1
+    samples_concealed: int = field(default=0, init=False)
     _gated_told: int = field(default=0, init=False)
 
     @classmethod
@@ -200,6 +201,7 @@ class LiveInput:
             problem = f"block {block.sequence} of emitter {self.id!r} is not newer than {self.newest_sequence}"
             raise RequestError("stale_block", problem, field="sequence")
         self.newest_sequence = block.sequence
+        self.samples_concealed += block.concealed
         self.source.push(block.samples)
 
     @property
@@ -210,6 +212,7 @@ class LiveInput:
             samples_queued=source.queued,
             samples_dropped=source.samples_dropped,
             samples_gated=source.samples_gated,
+            samples_concealed=self.samples_concealed,
             underruns=source.underruns,
         )
 

@@ -17,7 +17,7 @@ from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.plan import Plan
 from server.planning.planned_effects import PlanRequest
-from server.protocol.blocks import AudioBlock
+from server.protocol.blocks import AudioBlock, Packets
 from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
 from server.protocol.server_messages import Durations, Error, LevelReason, ServerMessage, Status
 from server.rendering.output import Rendered
@@ -46,10 +46,12 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class TimedBlock:
-    """A block to be sent; after `deadline_s` of the audio engine's clock it is late."""
+    """A block to be sent; after `deadline_s` of the audio engine's clock it is late. In Opus `packets` take the place
+    of its samples once they are encoded."""
 
     block: AudioBlock
     deadline_s: float
+    packets: Packets | None = None
 
 
 @dataclass(frozen=True)

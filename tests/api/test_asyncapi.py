@@ -19,18 +19,18 @@ from server.api.asyncapi import document
 from server.api.settings import Settings
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.blocks import AudioBlock, DryBlock, DryPackets
 from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
-    ClientMessage,
     Hello,
     ListenerPose,
     Ping,
     RemoveEmitter,
     SetEffects,
     SetLevel,
+    TextMessage,
     parse_client_message,
 )
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
@@ -44,9 +44,7 @@ from tests.protocol.test_client_messages import CLIENT_MESSAGES, SERVER_MESSAGES
 DOCUMENT = json.loads(document())
 MESSAGES = DOCUMENT["components"]["messages"]
 BINARY = {"listener_binary", "dry_block", "audio_block"}
-OF_CLIENTS = {each.type for each in get_args(ClientMessage)[-1:]} | {
-    each.model_fields["type"].default for each in get_args(ClientMessage)[:-1]
-}
+OF_CLIENTS = {DryBlock.type} | {each.model_fields["type"].default for each in get_args(TextMessage)}
 OF_SERVER = {each.model_fields["type"].default for each in get_args(ServerMessage)}
 SERVER = Path(streaming.__file__).parents[1]
 CODES = {"B": "u8", "H": "u16", "I": "u32", "Q": "u64", "f": "f32"}
@@ -211,7 +209,7 @@ def test_schemas_refuse_what_the_server_refuses_and_nothing_else(name, said):
     for each in changed:
         problem = refusal(each)
         is_of_several_fields = problem is not None and (
-            problem.field in {None, "listener", "directivity"} or "belongs to a" in str(problem)
+            problem.field in {None, "listener", "directivity", "opus"} or "belongs to a" in str(problem)
         )
         if takes(each):
             assert problem is None or is_of_several_fields, (each, str(problem))
@@ -236,7 +234,7 @@ def read(name, data):
     return values, data[end:]
 
 
-@pytest.mark.parametrize("flag", ["is_exchange", "is_late", "is_limited"])
+@pytest.mark.parametrize("flag", ["is_exchange", "is_late", "is_limited", "is_restart"])
 def test_an_audio_block_is_read_by_the_document(flag):
     samples = np.array([[0.5, 0.25, 0.0], [-0.5, -0.25, 1.0]], np.float32)
     block = AudioBlock(2, 2**40 + 3, 5, 4, samples, **{flag: True})
@@ -271,6 +269,14 @@ def test_a_dry_block_is_read_by_the_document():
     encodings = MESSAGES["dry_block"]["x-layout"]["header"][1]["meaning"]
     assert "0 f32" in encodings
     assert "1 s16" in encodings
+    assert "2 opus" in encodings
+
+
+def test_a_dry_block_in_opus_is_read_by_the_document():
+    header, rest = read("dry_block", DryPackets("voice", 7, 480, (b"one", b"second")).serialize())
+    assert header == {"kind": 3, "encoding": 2, "id_bytes": 5, "sequence": 7, "frames": 480}
+    assert rest == b"voice\0\0\0" + struct.pack("<H", 3) + b"one" + struct.pack("<H", 6) + b"second"
+    assert "each after its length in bytes (u16)" in MESSAGES["dry_block"]["x-layout"]["then"]
 
 
 # Where requests are refused that are no messages of a stream; what `errors` names is a field_failure in one.

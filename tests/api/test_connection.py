@@ -20,6 +20,7 @@ from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, H
 from server.protocol.server_messages import Error, Status, parse_server_message
 from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
+from server.runtime.thread_pool import ThreadPool
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.quality_steps import Offer
@@ -75,12 +76,14 @@ async def hosting(field, hrtfs, **settings):
             offers={"flat": Offer((field.level,), {field.level.name: 1.0})},
             places={"flat": place_of_field(field)},
             readiness=Readiness(Drain(8.0), warm_up="done"),
+            encoders=ThreadPool(1, "encoder", patience_s=10.0),
         )
         audio.start()
         try:
             yield host
         finally:
             await asyncio.to_thread(audio.stop)
+            await asyncio.to_thread(host.encoders.stop, 1.0)
 
 
 async def stop_reading(socket, message):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.api.inflow import USUAL, Allowance, Budget, message_cost, supersedes
-from server.protocol.blocks import DryBlock
+from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.client_messages import Acknowledge, ListenerPose, MoveEmitter, Ping
 
 
@@ -60,6 +60,26 @@ def test_the_most_talkative_player_there_can_be_never_waits(sample_rate):
     for now_s, message, is_text in sorted(due, key=lambda each: each[0]):
         budget.spend(message_cost(message, is_text=is_text), len(message) + 8, now_s)
         assert budget.wait_s == 0
+
+
+@pytest.mark.parametrize("frame_ms", [5, 10, 20, 60])
+@pytest.mark.parametrize("sample_rate", [24_000, 48_000])
+def test_microphones_in_opus_never_wait(sample_rate, frame_ms):
+    budget = Budget(Allowance.of(emitters=16, sample_rate=sample_rate), 0.0)
+    frames = sample_rate * frame_ms // 1000
+    live = DryPackets("emitter-12", 1, frames, (bytes(2 * frame_ms * 8),)).serialize()
+    for number in range(3_000 // frame_ms):
+        for _ in range(16):
+            budget.spend(message_cost(live, is_text=False), len(live) + 8, number * frame_ms / 1000)
+        assert budget.wait_s == 0
+
+
+def test_a_block_in_opus_costs_by_how_long_it_says_it_lasts_and_never_without_end():
+    costs = [
+        message_cost(DryPackets("a", 1, frames, (b"x",)).serialize(), is_text=False)
+        for frames in (120, 480, 2_880, 2**32 - 1)
+    ]
+    assert costs == [1.0, 2.5, 12.5, 12.5]
 
 
 def text(pose_id, **more):

@@ -2,6 +2,7 @@ import itertools
 import json
 import math
 import struct
+import threading
 import time
 from contextlib import contextmanager, suppress
 
@@ -15,8 +16,12 @@ from starlette.websockets import WebSocketDisconnect
 from server.api.app import create_app
 from server.api.settings import Settings
 from server.field.fields_by_level import FieldsByLevel
-from server.protocol.blocks import AudioBlock, DryBlock
+from server.protocol.blocks import AudioBlock, DryBlock, DryPackets
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter
+from server.protocol.codecs import libopus
+from server.protocol.codecs.libopus import OpusEncoder
+from server.protocol.opus import OpusOptions
+from server.protocol.packets import BlockReader
 from server.protocol.server_messages import (
     EmitterAdded,
     EmitterEnded,
@@ -87,9 +92,10 @@ class Ears:
     """A client that says hello, acknowledges every block, and can wait for what it wants to hear."""
 
     def __init__(self, socket, hello=HELLO):
-        self.socket, self.encoding = socket, hello.encoding
+        self.socket = socket
         self.send(hello)
         self.welcome = self.until(Welcome)
+        self.reader = BlockReader(self.welcome)
 
     def send(self, message):
         self.socket.send_text(message if isinstance(message, str) else message.serialize())
@@ -100,7 +106,7 @@ class Ears:
             raise WebSocketDisconnect(message["code"], message.get("reason"))
         if message.get("text") is not None:
             return parse_server_message(message["text"])
-        block = AudioBlock.parse(message["bytes"], self.encoding)
+        block = self.reader.read(message["bytes"])
         self.send(Acknowledge(sequence=block.sequence))
         return block
 
@@ -174,6 +180,120 @@ def test_integer_samples_and_other_block_sizes_are_negotiated(client):
         assert ears.until(AudioBlock).samples.shape == (2, 512)
         ears.send(TALKER)
         assert 0.001 < np.abs(ears.until_sound().samples).max() <= 1
+
+
+def opus(**options):
+    return Hello(protocol=PROTOCOL, scene="flat", encoding="opus", opus=OpusOptions(**options))
+
+
+def heard_from_its_beginning(client, hello, seconds=0.5):
+    """What a stream hears of a clip from when it is added on: (2, n)."""
+    with client.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, hello)
+        ears.send(ListenerPose(pose_id=1, position=(2.0, 3.5, 1.5), yaw=0.3))
+        ears.send(AddEmitter(id="talker", clip="tone", position=(2.0, 3.0, 1.5)))
+        clock, sound = ears.until(EmitterAdded).sample_clock, np.zeros((2, round(seconds * 24_000)))
+        while True:
+            block = ears.until(AudioBlock)
+            before, after = block.sample_clock - clock, block.sample_clock - clock + block.samples.shape[1]
+            if after > sound.shape[1]:
+                return sound
+            if after > 0:
+                sound[:, max(0, before) : after] = block.samples[:, max(0, -before) :]
+
+
+def test_a_stream_in_opus_sounds_like_one_in_floats_at_the_same_clock(client):
+    floats = heard_from_its_beginning(client, HELLO)
+    for options in ({"bitrate": 128_000}, {"bitrate": 192_000, "frame_ms": 20, "application": "audio"}):
+        coded = heard_from_its_beginning(client, opus(**options))
+        error = np.sum((coded - floats) ** 2) / np.sum(floats**2)
+        assert error < 0.01, options
+
+
+def test_a_welcome_says_how_to_decode(client):
+    with client.websocket_connect("/v1/stream") as socket:
+        welcome = Ears(socket, opus(frame_ms=5, complexity=0)).welcome
+        assert (welcome.encoding, welcome.opus.frame_samples, welcome.opus.look_ahead) == ("opus", 120, 60)
+        assert welcome.opus.streams == (2,)
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_text(HELLO.serialize())
+        assert "opus" not in json.loads(socket.receive_text())
+
+
+def test_ambisonics_in_opus_have_a_stream_for_each_pair(client_of_directions):
+    hello = Hello(protocol=PROTOCOL, scene="flat", output="ambisonics", order=2, encoding="opus")
+    with client_of_directions.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, hello)
+        assert ears.welcome.opus.streams == (2, 2, 2, 2, 1)
+        ears.send(TALKER)
+        assert ears.until_sound().samples.shape[0] == 9
+
+
+def test_blocks_are_encoded_on_a_thread_for_it(client, monkeypatch):
+    """And neither on the event loop, which all clients share, nor on an audio thread."""
+    threads, encode = set(), OpusEncoder.encode
+
+    def watched(encoder, frame):
+        threads.add(threading.current_thread().name)
+        return encode(encoder, frame)
+
+    monkeypatch.setattr(OpusEncoder, "encode", watched)
+    with client.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, opus())
+        for _ in range(10):
+            ears.until(AudioBlock)
+    assert threads
+    assert threads <= {"nafir-encoder-0", "nafir-encoder-1"}
+
+
+def test_a_stream_that_cannot_be_encoded_ends_and_says_so(client, monkeypatch, caplog):
+    with client.websocket_connect("/v1/stream") as socket:
+        ears = Ears(socket, opus())
+        ears.until(AudioBlock)
+        monkeypatch.setattr(OpusEncoder, "encode", None)
+        assert ears.until(Error).code == "internal_error"
+        with pytest.raises(WebSocketDisconnect):
+            ears.receive()
+    assert "could not be encoded" in caplog.text
+    monkeypatch.undo()
+    assert client.get("/readyz").status_code == 200
+    with client.websocket_connect("/v1/stream") as socket:
+        Ears(socket, opus()).until(AudioBlock)
+
+
+def test_where_there_is_no_opus_a_hello_is_told(client, monkeypatch):
+    offered = client.get("/v1/encodings").json()["encodings"]
+    assert [each["name"] for each in offered] == ["f32", "s16", "opus"]
+    assert offered[2]["sample_rates"] == [8_000, 12_000, 16_000, 24_000, 48_000]
+    monkeypatch.setattr(libopus, "_library", lambda: None)
+    assert [each["name"] for each in client.get("/v1/encodings").json()["encodings"]] == ["f32", "s16"]
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_text(opus().serialize())
+        error = parse_server_message(socket.receive_text())
+        assert (error.code, error.field) == ("unsupported_encoding", "encoding")
+        with pytest.raises(WebSocketDisconnect):
+            socket.receive_text()
+
+
+def test_live_packets_are_heard_and_broken_ones_refused(ears):
+    ears.send(ListenerPose(pose_id=1, position=(2.0, 2.5, 1.5), yaw=0.0))
+    ears.send(AddEmitter(id="voice", live=True, position=(2.0, 3.5, 1.5)))
+    ears.until(EmitterAdded)
+    encoder = OpusEncoder(sample_rate=24_000, channels=1, application="voip", bitrate=32_000, complexity=5)
+    tone = np.sin(np.arange(480 * 40) * 2 * np.pi * 8 / 256).astype(np.float32).reshape(40, 480, 1)
+    energy = np.zeros(2)
+    for sequence, frame in enumerate(tone):
+        packet = encoder.encode(frame)
+        if sequence == 20:
+            continue  # lost
+        if sequence == 21:
+            ears.socket.send_bytes(DryPackets("voice", 21, 480, (b"\xff\x3f",)).serialize())
+            assert ears.until(Error).code == "malformed_block"
+        ears.socket.send_bytes(DryPackets("voice", sequence, 480, (packet,)).serialize())
+        energy += sum(np.sum(ears.until(AudioBlock).samples ** 2, axis=1) for _ in range(2))
+    assert energy[0] > 2 * energy[1] > 0  # it stands to the left
+    (live,) = ears.until(Status, lambda status: status.live and status.live[0].samples_concealed).live
+    assert (live.id, live.samples_concealed) == ("voice", 480)
 
 
 def test_a_server_that_is_ready_has_measured_what_the_page_asks_for(client_of_directions, monkeypatch):

@@ -1,6 +1,7 @@
 import json
 import math
 import struct
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from server.protocol.client_messages import (
     StopEmitter,
     parse_client_message,
 )
+from server.protocol.opus import OpusOptions
 from server.protocol.server_messages import (
     Durations,
     EmitterAdded,
@@ -56,6 +58,12 @@ CLIENT_MESSAGES = [
         listener=ListenerStart(position=(1, 2, 1.5), yaw=0.3),
         hrtf="kemar",
         buffer_blocks=4,
+    ),
+    Hello(
+        protocol=PROTOCOL,
+        scene="flat",
+        encoding="opus",
+        opus=OpusOptions(frame_ms=20, bitrate=64_000, complexity=10, application="audio", signal="voice"),
     ),
     AddEmitter(id="talker", clip="speech", position=(1, 2, 3), gain_db=-6, loop=False),
     AddEmitter(id="talker", live=True, position=(1, 2, 3), yaw=2.0, directivity=DirectivityPattern(pattern="cardioid")),
@@ -301,14 +309,17 @@ def integers(schema, whole):
 def test_every_integer_may_be_written_with_a_fraction_of_zero(message):
     schema = type(message).model_json_schema()
     said = json.loads(message.serialize())
-    for name, *deeper in integers(schema, schema):
-        assert not deeper
-        if said[name] is not None:
-            written = json.dumps(said | {name: float(said[name])})
-            assert parse_client_message(written) == message
-            for wrong in (said[name] + 0.5, str(said[name]), True):
+    for *above, name in integers(schema, schema):
+        inner = reduce(lambda document, key: document and document[key], above, said)
+        value = inner and inner[name]
+        if value is not None:
+            inner[name] = float(value)
+            assert parse_client_message(json.dumps(said)) == message
+            for wrong in (value + 0.5, str(value), True):
+                inner[name] = wrong
                 with pytest.raises(RequestError):
-                    parse_client_message(json.dumps(said | {name: wrong}))
+                    parse_client_message(json.dumps(said))
+            inner[name] = value
 
 
 @pytest.mark.parametrize("message", SERVER_MESSAGES, ids=lambda m: m.type)
