@@ -55,7 +55,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
-.PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor
+.PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor audit deploy-check
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
 help: ## show this list
@@ -141,6 +141,13 @@ lock: $(VENV)/installed-dev ## take newer versions into requirements.lock, the b
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --upgrade --generate-hashes --strip-extras \
 		--no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options \
 		--output-file requirements.lock pyproject.toml
+
+audit: $(VENV)/installed-deploy ## look for known vulnerabilities in requirements.lock (asks the network), and write sbom.json (CycloneDX)
+	$(BIN)/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml --output-reproducible --of JSON -o sbom.json
+	$(BIN)/pip-audit --require-hashes --disable-pip --strict --requirement requirements.lock
+
+deploy-check: $(VENV)/installed-deploy ## check deploy/ with the programs that read it, of those that are installed: promtool, caddy, systemd-analyze
+	$(BIN)/pytest tests/deploy -rs
 
 vendor: ## fetch Swagger UI and Redoc, of the versions in this file, into server/web/vendor (needs npm)
 	rm -rf build/vendor && mkdir -p build/vendor
@@ -266,6 +273,11 @@ $(VENV)/installed-dev: pyproject.toml $(CLIENT)/pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[dev]' --editable '$(CLIENT)[clips,play,record]'
 	@$(BYTECODE)
 	@touch $(VENV)/installed-server $(VENV)/installed-training $@
+
+$(VENV)/installed-deploy: pyproject.toml | $(VENV)/installed-dev
+	@echo "Installing what checks a deployment into $(VENV), once ..."
+	$(PIP) --editable '.[dev,deploy]'
+	@touch $@
 
 $(VENV)/installed-cluster: pyproject.toml | $(VENV)/installed-dev
 	@echo "Installing Ray into $(VENV), once ..."

@@ -1,0 +1,211 @@
+"""What `deploy/` names exists: settings with their values, metrics, times that fit together. Where the programs that
+read these files are installed, they read them too."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from server.api.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+ALERTS = DEPLOY / "prometheus" / "alerts.yml"
+DASHBOARD = DEPLOY / "grafana" / "nafir.json"
+UNIT = DEPLOY / "systemd" / "nafir.service"
+MANIFESTS = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
+OF_PROMETHEUS = {"up", "process_start_time_seconds", "process_resident_memory_bytes"}
+HISTOGRAM = ("_bucket", "_sum", "_count")
+
+
+def documents(path):
+    return [each for each in yaml.safe_load_all(path.read_text()) if each]
+
+
+def manifest(kind):
+    (found,) = [each for path in MANIFESTS for each in documents(path) if each["kind"] == kind]
+    return found
+
+
+def compose():
+    (found,) = documents(DEPLOY / "compose.yaml")
+    return found
+
+
+def container():
+    (found,) = manifest("Deployment")["spec"]["template"]["spec"]["containers"]
+    return found
+
+
+def seconds(text):
+    return float(re.fullmatch(r"([0-9.]+)s?", text)[1])
+
+
+def filled_in(text):
+    """A value of the compose file with its default, or a word where it has none."""
+    return re.sub(r"\$\{\w+(?::([-?])([^}]*))?\}", lambda found: found[2] if found[1] == "-" else "word", text)
+
+
+def of_compose():
+    return {name: filled_in(text) for name, text in compose()["services"]["server"]["environment"].items()}
+
+
+def of_kubernetes():
+    return {each["name"]: each["value"] for each in container()["env"]}
+
+
+def of_systemd():
+    words = re.findall(r"^Environment=(.*)$", UNIT.read_text(), re.MULTILINE)
+    return dict(each.split("=", 1) for line in words for each in line.split())
+
+
+ENVIRONMENTS = {"compose": of_compose, "kubernetes": of_kubernetes, "systemd": of_systemd}
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_every_setting_exists_and_takes_its_value(name, monkeypatch):
+    given = {each: text for each, text in ENVIRONMENTS[name]().items() if each.startswith("NAFIR_")}
+    assert len(given) >= 2
+    for each, text in given.items():
+        monkeypatch.setenv(each, text)
+    assert Settings().require_auth  # raises for a variable that is no setting
+
+
+@pytest.fixture(scope="module")
+def metrics():
+    """Names of all metrics that a server has, from the reference."""
+    sys.path.insert(0, str(ROOT / "docs" / "hooks"))
+    try:
+        from reference_services import metrics
+
+        return set(re.findall(r"`(nafir_\w+)`", metrics()))
+    finally:
+        sys.path.pop(0)
+
+
+def expressions():
+    for group in documents(ALERTS)[0]["groups"]:
+        yield from (rule["expr"] for rule in group["rules"])
+    for panel in json.loads(DASHBOARD.read_text())["panels"]:
+        yield from (target["expr"] for target in panel.get("targets", ()))
+
+
+def test_every_metric_exists(metrics):
+    named = set()
+    for each in expressions():
+        without_labels = re.sub(r"\{[^}]*\}|\"[^\"]*\"|(?:by|without) \([^)]*\)", "", each)
+        named |= set(re.findall(r"\b(?:nafir|process)_\w+|\bup\b", without_labels))
+    assert len(named) > 15
+    whole = {name.removesuffix(next((end for end in HISTOGRAM if name.endswith(end)), "")) for name in named}
+    assert whole <= metrics | OF_PROMETHEUS
+
+
+def test_every_panel_has_its_place():
+    panels = json.loads(DASHBOARD.read_text())["panels"]
+    assert len({each["id"] for each in panels}) == len(panels)
+    taken = set()
+    for each in panels:
+        at = each["gridPos"]
+        cells = {(x, y) for x in range(at["x"], at["x"] + at["w"]) for y in range(at["y"], at["y"] + at["h"])}
+        assert not cells & taken, each["title"]
+        assert at["x"] + at["w"] <= 24
+        taken |= cells
+
+
+def test_nobody_is_cut_off_before_the_server_has_drained():
+    default_s = Settings.model_fields["drain_s"].default
+    assert seconds(filled_in(compose()["services"]["server"]["stop_grace_period"])) > float(
+        of_compose()["NAFIR_DRAIN_S"]
+    )
+    pod = manifest("Deployment")["spec"]["template"]["spec"]
+    waits_s = int(re.search(r"sleep\((\d+)\)", str(container()["lifecycle"]["preStop"]))[1])
+    assert pod["terminationGracePeriodSeconds"] > waits_s + float(of_kubernetes()["NAFIR_DRAIN_S"])
+    assert int(re.search(r"TimeoutStopSec=(\d+)", UNIT.read_text())[1]) > default_s
+
+
+def test_the_proxy_gives_up_connections_before_the_server_does():
+    kept_s = seconds(re.search(r"keepalive (\S+)", (DEPLOY / "Caddyfile").read_text())[1])
+    assert kept_s < Settings.model_fields["keep_alive_s"].default
+
+
+def test_containers_run_without_privileges():
+    for name, service in compose()["services"].items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert "mem_limit" in service
+        assert "healthcheck" in service or name == "server"  # whose image has one
+    assert "ports" not in compose()["services"]["server"]
+    assert container()["securityContext"]["readOnlyRootFilesystem"]
+    assert manifest("Deployment")["spec"]["template"]["spec"]["securityContext"]["runAsNonRoot"]
+
+
+def test_what_is_mounted_is_here():
+    for service in compose()["services"].values():
+        for each in service.get("volumes", ()):
+            source = each.partition(":")[0]
+            if source.startswith("."):
+                assert (DEPLOY / source).exists(), source
+            else:
+                assert source in compose()["volumes"]
+        for each in service.get("secrets", ()):
+            assert each in compose()["secrets"]
+
+
+def test_selectors_find_the_pods():
+    labels = manifest("Deployment")["spec"]["template"]["metadata"]["labels"]
+    assert manifest("Service")["spec"]["selector"] == labels
+    for kind, key in (
+        ("Deployment", "selector"),
+        ("PodDisruptionBudget", "selector"),
+        ("NetworkPolicy", "podSelector"),
+    ):
+        assert manifest(kind)["spec"][key]["matchLabels"] == labels
+    target = manifest("HorizontalPodAutoscaler")["spec"]["scaleTargetRef"]
+    assert (target["kind"], target["name"]) == ("Deployment", manifest("Deployment")["metadata"]["name"])
+
+
+@pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.name)
+def test_manifests_are_valid(path):
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install nafir[deploy]").validate
+    for each in documents(path):
+        validate(each, "1.31", strict=True)
+
+
+def run(program, *arguments, **options):
+    if shutil.which(program) is None:
+        pytest.skip(f"{program} is not installed")
+    ran = subprocess.run(
+        [program, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False, **options
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
+
+
+def test_alerts_begin_when_they_should():
+    run("promtool", "check", "config", "--syntax-only", DEPLOY / "prometheus" / "prometheus.yml")
+    run("promtool", "check", "rules", ALERTS)
+    run("promtool", "test", "rules", "alerts.test.yml", cwd=ALERTS.parent)
+
+
+def test_the_proxy_is_configured(tmp_path):
+    environment = {**os.environ, "HOME": str(tmp_path), "DOMAIN": "sound.example"}
+    run("caddy", "validate", "--adapter", "caddyfile", "--config", DEPLOY / "Caddyfile", env=environment)
+    assert run("caddy", "fmt", DEPLOY / "Caddyfile") == (DEPLOY / "Caddyfile").read_text()
+
+
+def test_the_unit_is_one():
+    """Not that the program is where it says: that is the operator's matter."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    ran = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(UNIT)], capture_output=True, text=True, timeout=60, check=False
+    )
+    complaints = [line for line in ran.stderr.splitlines() if UNIT.name in line and "not executable" not in line]
+    assert complaints == []
