@@ -59,7 +59,7 @@ def _description() -> str:
 
 Control messages are JSON text, one object with a `type` each. Audio is sent in binary messages, and listener poses may
 be; their first byte is the kind. Binary is little endian. Units are metres, radians, decibels and samples at the
-scene's rate; x is east, y north, z up, and yaw counter-clockwise from +x. {encodings}.
+stream's rate; x is east, y north, z up, and yaw counter-clockwise from +x. {encodings}.
 
 **Unknown fields and messages.** The server refuses fields and messages that this version does not have, and names them.
 Otherwise a misspelt field would be ignored without notice. Clients ignore unknown fields, messages and kinds of binary

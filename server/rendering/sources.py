@@ -1,6 +1,7 @@
 """Sources of an emitter's dry signal: a clip, or live samples from a client.
 
-Samples are mono float32 at the scene's rate, full scale 1. A source fills one block at a time, on the rendering thread.
+Samples are mono float32 at the stream's rate, full scale 1. A source fills one block at a time, on the rendering
+thread.
 
 Where a clip is and when it starts and stops is one `PLAYBACK` record. Compiled code (`server.rendering.mixing_kernel`)
 plays a copy of it; `ClipPlayer` does the same in NumPy.
