@@ -18,9 +18,18 @@ from pydantic_core import core_schema
 from server.api.inflow import MOVES_PER_S, POSES_PER_S
 from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
-from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, Ping, RemoveEmitter, TextMessage
+from server.protocol.client_messages import (
+    PROTOCOL,
+    AddEmitter,
+    Hello,
+    ListenerPose,
+    Ping,
+    RemoveEmitter,
+    Resume,
+    TextMessage,
+)
 from server.protocol.codecs.registry import CODECS, OPUS_MEANING
-from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES
+from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES, TAKEN_OVER
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
 from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error, Pong, ServerMessage, Welcome
@@ -33,6 +42,7 @@ _CLIENT: Final[tuple[type[Message], ...]] = get_args(TextMessage)
 _SERVER: Final[tuple[type[Message], ...]] = get_args(ServerMessage)
 _ANSWERS: Final[dict[type[Message], type[Message]]] = {
     Hello: Welcome,
+    Resume: Welcome,
     AddEmitter: EmitterAdded,
     RemoveEmitter: EmitterRemoved,
     Ping: Pong,
@@ -66,10 +76,10 @@ Otherwise a misspelt field would be ignored without notice. Clients ignore unkno
 messages, since a server may add some within a version. Whole numbers may have a fraction of zero (`1.0`). The version
 in a `hello` is read first; another version is answered `unsupported_protocol`, whatever else the hello contains.
 
-**Hello first.** The first message is a `hello`, within {_default("hello_timeout_s"):g} s. The server answers with a
-`welcome`, after which audio flows, or with an `error`, after which the connection ends. A message has at most
-{_default("max_message_bytes")} bytes, and one of more than {_default("max_frame_bytes")} ends the connection. These are
-defaults; an operator may set other limits.
+**Hello first.** The first message is a `hello`, or a `resume`, within {_default("hello_timeout_s"):g} s. The server
+answers with a `welcome`, after which audio flows, or with an `error`, after which the connection ends. A message has at
+most {_default("max_message_bytes")} bytes, and one of more than {_default("max_frame_bytes")} ends the connection.
+These are defaults; an operator may set other limits.
 
 **Keys.** Where the server asks for a key, the handshake carries it as `Authorization: Bearer KEY` or, from a browser,
 as one of the subprotocols: `nafir.key.` and the key in base64url, beside `nafir.v{PROTOCOL}`, which the server chooses.
@@ -97,6 +107,16 @@ turn, and none if its samples complete none. Keep a decoder for each stream, giv
 anew with every block that has `is_restart`: new decoders, whose first `look_ahead` samples are dropped. What remains is
 heard from `sample_clock` on, and there are `frames` of it; so samples of an Opus stream and of another have the same
 clock. Live input may be in Opus too, whatever the encoding of the stream.
+
+**Resuming.** If the connection is lost (not closed by the client with 1000, 1001 or no code), the server keeps the
+state of the stream for {_default("resume_s"):g} s: emitters, clips, gains, level, effects, poses and clock. The client
+opens a new connection and begins with a `resume` in place of a `hello`. The `welcome` then has `resumed`: where
+`sample_clock` and `sequence` go on, and what had arrived, so that the client sends again what had not. The clock goes
+on during the gap as if the stream had been heard, and clips with it: they fade in where they would be by now. Each
+`welcome` has another `resume_token`; the former one is good until the first `acknowledge`. If the server still believes
+in the old connection, it is taken over and closed with {TAKEN_OVER}. What live emitters had sent before is gone; they
+go on with the next `dry_block`. Statistics and the window begin anew. A `resume` is refused like a `hello` while the
+server has no room (`server_busy`), and may be tried again.
 
 **Flow control by acknowledgement.** At most `window` blocks (see `welcome`) are sent without an `acknowledge`. One
 `acknowledge` stands for all earlier blocks, so every fourth block or so is enough. While the window is full, blocks are

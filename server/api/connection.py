@@ -8,6 +8,9 @@ slowly that its messages pile up is cut off. So is a client that acknowledges no
 A connection takes up one of the server's streams only with its hello. The number of connections without a hello is
 limited: one too many ends the one that has been silent for longest, so that silent clients keep no others out.
 
+If a connection is lost, a snapshot of its stream is kept (`server.api.kept_streams`). A new connection that begins with
+a `resume` opens a stream in that state, at the sample clock which the lost one would have reached by then.
+
 The reason for ending a connection is returned and not raised. An exception kept by a task refers to frames that refer
 to the task, and a session in that cycle would stay in memory until the garbage collector runs.
 """
@@ -16,10 +19,11 @@ import asyncio
 import contextlib
 import dataclasses
 import math
+import re
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -32,6 +36,7 @@ from server.api.access_gate import caller_of
 from server.api.block_encoding import BlockEncoding
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
+from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
 from server.api.process_peers import ProcessPeers
 from server.api.response_cache import ResponseCache
@@ -46,32 +51,40 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
 from server.planning.scene_acoustics import SceneAcoustics
-from server.protocol.blocks import DryPackets
+from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.client_messages import (
     AUTO,
     PROTOCOL,
+    Acknowledge,
     AddEmitter,
     ClientMessage,
     Hello,
+    ListenerPose,
+    MoveEmitter,
     Ping,
     RemoveEmitter,
+    Resume,
     SetEffects,
     SetLevel,
     emitter_of,
     parse_client_message,
+    require_protocol,
 )
 from server.protocol.codecs.registry import SampleEncoding, is_of_samples, require_encoding
 from server.protocol.codes import (
     ACCESS_ENDED,
+    GOODBYES,
     INTERNAL_ERROR,
     NORMAL,
     POLICY_VIOLATION,
     SERVICE_RESTART,
+    TAKEN_OVER,
     TRY_AGAIN_LATER,
 )
 from server.protocol.opus import OpusOptions
 from server.protocol.packets import BlockEncoder, LiveDecoders
-from server.protocol.server_messages import EmitterEnded, Error, Pong, ServerMessage, Welcome
+from server.protocol.server_messages import EmitterEnded, Error, Pong, Resumed, ServerMessage, Welcome
+from server.protocol.snapshot import MOST_BYTES, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.racing import StoppedError, run_until
@@ -81,19 +94,25 @@ from server.streaming.admission import Admission, Place, Refusal
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
 from server.streaming.headroom import RenderCost, StreamKind
-from server.streaming.inbox import ChosenSteps
+from server.streaming.inbox import ChosenSteps, TakeSnapshot
 from server.streaming.load_policy import Ladder
 from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.render_costs import kind_of, measure_rendering
 from server.streaming.session import Session
-from server.streaming.stream import Outgoing, Stream, StreamFailed, TimedBlock
+from server.streaming.stream import Outgoing, Stream, StreamFailed, StreamState, TimedBlock
 
 MAX_WAITING_ANSWERS = 256
 SUBPROTOCOL: Final = f"nafir.v{PROTOCOL}"
 """The subprotocol that is chosen if a client offers it. Browsers close a connection without a choice."""
 _GOODBYE_S = 1.0
 """Limit for sending the close frame. It waits for room in the socket, which a client that does not read never makes."""
+_STATE_S = 1.0
+"""Limit for the state of a stream to come from its audio thread, which usually takes a block."""
+_UNCOUNTED: Final = ListenerPose | MoveEmitter | DryBlock | DryPackets | Acknowledge | Ping
+"""Messages that do not count as handled (`Snapshot.handled`): they have numbers of their own, or need not be sent
+again."""
+_UNCOUNTED_TYPE: Final = re.compile(r'"type"\s*:\s*"(listener|move_emitter|acknowledge|ping)"')
 
 
 def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
@@ -122,6 +141,9 @@ class Goodbye:
 
 _TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
 _DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
+_TAKEN_OVER: Final = Goodbye(
+    TAKEN_OVER, Error(code="taken_over", message="the client has resumed the stream on another connection")
+)
 _FAILED: Final = Goodbye(INTERNAL_ERROR, Error(code="internal_error", message="the stream failed"))
 
 _EXPIRED: Final = Error(code="key_expired", message="the key or token has expired: connect again with a new one")
@@ -130,6 +152,14 @@ _ENDINGS: Final[Mapping[Ending, Goodbye]] = {
     "key_expired": Goodbye(ACCESS_ENDED, _EXPIRED),
     "key_revoked": Goodbye(ACCESS_ENDED, _REVOKED),
 }
+
+
+def _counts(message: ClientMessage | None, data: str | bytes) -> bool:
+    """Whether a client may have to send a message again after a resume, unless it was handled (`Snapshot.handled`).
+    `message` is None if it could not be read."""
+    if message is not None:
+        return not isinstance(message, _UNCOUNTED)
+    return isinstance(data, str) and _UNCOUNTED_TYPE.search(data) is None
 
 
 def _refused(refusal: RequestError) -> Goodbye:
@@ -154,6 +184,15 @@ class MeasuredScene:
     place: SceneAcoustics
     offer: Offer
     render_costs: Mapping[str, RenderCost]
+
+
+@dataclass(frozen=True)
+class _LostStream:
+    """A stream that a client has `asked` to go on with."""
+
+    asked: Resume
+    kept: KeptStream
+    snapshot: Snapshot
 
 
 @dataclass
@@ -191,6 +230,8 @@ class StreamHost:
     """Counts of all streams, open and ended."""
     admission: Admission = dataclasses.field(init=False)
     """The places of all streams, open or being opened."""
+    kept: KeptStreams = dataclasses.field(init=False)
+    """Streams that have lost their clients."""
     openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
     """Creates sessions one after the other, since each takes about 8 ms of CPU time."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
@@ -204,11 +245,14 @@ class StreamHost:
             is_on=self.settings.admission,
             thresholds=dataclasses.replace(THRESHOLDS, ir_share=self.settings.ir_share),
         )
+        self.kept = KeptStreams(
+            keep_s=self.settings.resume_s, most=self.settings.max_streams, give_up=self.admission.leave
+        )
 
     @property
     def streams(self) -> int:
         """Number of streams that are open or being opened."""
-        return self.admission.streams
+        return self.admission.streams - self.admission.held
 
     def kind_of(self, hello: Hello, levels: FieldsByLevel) -> StreamKind | None:
         """The kind of stream that a hello asks for; None until it is measured what rendering costs."""
@@ -218,9 +262,12 @@ class StreamHost:
         return kind_of(levels, costs, block_size=hello.block_size, order=hello.ambisonic_order)
 
     def turn_away(self) -> Response | None:
-        """The answer to whoever asks for a stream while not even the cheapest has room; None if one has."""
+        """The answer to whoever asks for a stream while not even the cheapest has room; None if one has, or if it may
+        be a client that comes back."""
         if self.readiness.obstacle is not None:
             return None  # which a client is told in the stream
+        if self.kept.has_places or any(stream.stalled_s > 0 for stream in self.audio.streams):
+            return None
         refusal = self.admission.turn_away()
         if refusal is None:
             return None
@@ -300,13 +347,25 @@ class Connection:
         self._has_outgoing = asyncio.Event()
         self._is_sending = self._is_handling = False
         self._capacity = MAX_WAITING_ANSWERS
-        self._is_overfull = asyncio.Event()
+        self._goodbye: Goodbye | None = None
+        """Why the connection is to end."""
+        self._is_ending = asyncio.Event()
+        self._close_code: int | None = None
+        """The client's, once it is known."""
         self._stream: Stream | None = None
         self._place: Place | None = None
         self._encoding: SampleEncoding = "f32"
         """How blocks without packets are sent."""
         self._block_encoding: BlockEncoding | None = None
         self._live_decoders: LiveDecoders | None = None
+        self._session = ""
+        self._token: str | None = None
+        self._is_confirmed = False
+        """Whether the client has shown that it has the token."""
+        self._has_resumed = False
+        self._handled = 0
+        self._state: asyncio.Future[StreamState] | None = None
+        """The state that the audio thread was asked for."""
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
@@ -340,9 +399,23 @@ class Connection:
         host = self._host
         if (obstacle := host.readiness.obstacle) is not None:
             return Goodbye(TRY_AGAIN_LATER, Error(code="not_ready", message=obstacle.message))
-        hello = await self._receive_hello()
-        if isinstance(hello, Goodbye):
-            return hello
+        first = await self._receive_first()
+        if isinstance(first, Goodbye):
+            return first
+        if isinstance(first, Hello):
+            return await self._serve_stream(first, None)
+        try:
+            lost = await self._find(first)
+        except RequestError as refusal:
+            return _refused(refusal)
+        try:
+            return await self._serve_stream(lost.snapshot.hello, lost)
+        finally:
+            if not self._has_resumed:
+                host.kept.put_back(lost.kept)
+
+    async def _serve_stream(self, hello: Hello, lost: _LostStream | None) -> Goodbye | None:
+        host = self._host
         try:
             levels, offer = await self._require_offer(hello)
             if offer is None:
@@ -350,19 +423,26 @@ class Connection:
             steps, others = self._steps(hello, levels, offer)
         except RequestError as refusal:
             return _refused(refusal)
-        place = host.admission.admit(host.kind_of(hello, levels), steps, hello.emitters, others=others)
-        if isinstance(place, Refusal):
-            return _busy(place)
+        place = None if lost is None else lost.kept.place
+        if place is None:
+            admitted = host.admission.admit(host.kind_of(hello, levels), steps, hello.emitters, others=others)
+            if isinstance(admitted, Refusal):
+                return _busy(admitted)
+            place = admitted
         try:
-            stream = await self._open(hello, levels, offer, Ladder(steps, steps.index(place.step)))
+            first_step = steps.index(place.step) if place.step in steps else 0
+            stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)
             if stream is None or isinstance(stream, Goodbye):
                 return stream
             host.admission.open(place, stream)
             return await self._pump(stream, hello, place)
         finally:
-            host.admission.leave(place)
+            if self._token is not None:
+                host.kept.close(self._token)
+            if not place.is_kept:
+                host.admission.leave(place)
 
-    async def _receive_hello(self) -> Hello | Goodbye:
+    async def _receive_first(self) -> Hello | Resume | Goodbye:
         host = self._host
         try:
             async with asyncio.timeout(host.settings.hello_timeout_s) as patience:
@@ -378,10 +458,25 @@ class Connection:
             return Goodbye(POLICY_VIOLATION, Error(code="hello_expected", message="no hello came in time"))
         except RequestError as refusal:
             return _refused(refusal)
-        if not isinstance(message, Hello):
+        if not isinstance(message, Hello | Resume):
             error = Error(code="hello_expected", message=f"the first message is a hello, not {message.type}")
             return Goodbye(POLICY_VIOLATION, error)
         return message
+
+    async def _find(self, asked: Resume) -> _LostStream:
+        """Take over the stream that a client asks for. Raises RequestError unknown_resume_token, and
+        unsupported_protocol."""
+        require_protocol(asked)
+        kept = await self._host.kept.take(asked.token)
+        if kept is None:
+            problem = f"no stream is kept for this token, or its {self._host.kept.keep_s:g} s are over: send a hello"
+            raise RequestError("unknown_resume_token", problem, field="token", status=404)
+        try:
+            return _LostStream(asked, kept, Snapshot.parse(kept.data))
+        except RequestError:
+            if kept.place is not None:
+                self._host.admission.leave(kept.place)
+            raise
 
     async def _require_offer(self, hello: Hello) -> tuple[FieldsByLevel, Offer | None]:
         """The levels that a hello may have, and their costs; None for these if the client has gone meanwhile. Raises
@@ -407,21 +502,25 @@ class Connection:
         steps = offer.steps(hello.level, block_s=block_s)
         return steps, () if hello.level == AUTO else offer.steps(AUTO, block_s=block_s)
 
-    async def _open(self, hello: Hello, levels: FieldsByLevel, offer: Offer, ladder: Ladder) -> Stream | Goodbye | None:
-        """Open a stream. Returns None if the client has gone meanwhile."""
+    async def _open(
+        self, hello: Hello, levels: FieldsByLevel, offer: Offer, ladder: Ladder, lost: _LostStream | None
+    ) -> Stream | Goodbye | None:
+        """Open a stream, or go on with a `lost` one. Returns None if the client has gone meanwhile."""
         settings = self._host.settings
         field = levels.default
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
         window = math.ceil(settings.window_blocks * field.sample_rate / levels.own_rate) + hello.buffer_blocks
         self._capacity = window + MAX_WAITING_ANSWERS
         try:
-            session = await self._host.openings.run(
-                partial(self._open_session, hello, levels, hrtf, ladder.step, window), is_wanted=self._is_there
+            opened = await self._host.openings.run(
+                partial(self._open_session, hello, levels, hrtf, ladder.step, window, lost), is_wanted=self._is_there
             )
         except RequestError as refusal:
             return _refused(refusal)
-        if session is None:
+        if opened is None:
             return None
+        session, errors = opened
+        block_s = hello.block_size / field.sample_rate
         encoder = None
         if is_of_samples(hello.encoding):
             self._encoding = hello.encoding
@@ -436,9 +535,13 @@ class Connection:
                 deliver=self._send_or_queue,
             )
         self._live_decoders = LiveDecoders(field.sample_rate, settings.max_emitters)
+        self._session = uuid.uuid4().hex if lost is None else lost.snapshot.session
+        if self._host.kept.keep_s:
+            former = None if lost is None else lost.asked.token
+            self._token = self._host.kept.open(partial(self._end, _TAKEN_OVER), former=former)
         await self._send_message(
             Welcome(
-                session=uuid.uuid4().hex,
+                session=self._session,
                 scene=describe_scene(levels),
                 sample_rate=field.sample_rate,
                 block_size=hello.block_size,
@@ -450,19 +553,38 @@ class Connection:
                 hrtf=hrtf,
                 level=ladder.step.level,
                 max_emitters=self._host.settings.max_emitters,
+                resume_token=self._token,
+                resume_s=None if self._token is None else self._host.kept.keep_s,
+                resumed=None if lost is None else self._continue(session, lost, block_s),
                 order=hello.ambisonic_order,
                 opus=None if encoder is None else encoder.streams,
             )
         )
+        self._enqueue(errors)
         return Stream(
             session,
             levels,
             offer=offer,
             ladder=ladder,
-            block_s=hello.block_size / field.sample_rate,
+            block_s=block_s,
             lead=hello.buffer_blocks,
             deliver=self._deliver,
         )
+
+    def _continue(self, session: Session, lost: _LostStream, block_s: float) -> Resumed:
+        """Set the clock of a session to where that of a `lost` stream would be if the next block played now."""
+        snapshot, sequence = lost.snapshot, lost.asked.sequence
+        blocks = max(0, math.ceil((self._time_s() - lost.kept.plays_s) / block_s) + 1)
+        sample_clock = snapshot.sample_clock + blocks * snapshot.hello.block_size
+        resumed = Resumed(
+            sample_clock=sample_clock,
+            sequence=snapshot.sequence if sequence is None else sequence + 1,
+            pose_id=snapshot.pose_id,
+            handled=snapshot.handled,
+        )
+        session.continue_at(resumed.sample_clock, resumed.sequence)
+        self._handled = snapshot.handled
+        return resumed
 
     async def _offer(self, hello: Hello, levels: FieldsByLevel) -> Offer | None:
         """The levels for a hello, with their costs. Those of an ambisonic order, or of another sample rate than the
@@ -481,14 +603,21 @@ class Connection:
         return self._fast_path is None or self._fast_path.is_open()
 
     def _open_session(
-        self, hello: Hello, levels: FieldsByLevel, hrtf: str, quality: QualityStep, window: int
-    ) -> Session:
+        self,
+        hello: Hello,
+        levels: FieldsByLevel,
+        hrtf: str,
+        quality: QualityStep,
+        window: int,
+        lost: _LostStream | None,
+    ) -> tuple[Session, list[ServerMessage]]:
+        """A session, and what of a `lost` stream it could not restore."""
         host, rate = self._host, levels.default.sample_rate
         filters, field_filters = host.head(hrtf, levels)
         clips = host.clips[hello.scene].at_rate(rate)
         # What effects cost is measured at the scene's own rate, and no plan says what is true of another.
         costs = host.effect_costs.get(hello.scene, {}) if rate == levels.own_rate else {}
-        return Session(
+        session = Session(
             hello,
             levels,
             filters,
@@ -506,22 +635,32 @@ class Connection:
             costs=lambda bus: costs.get(bus, {}),
             field_filters=field_filters,
         )
+        return session, [] if lost is None else session.restore(lost.snapshot)
 
     async def _pump(self, stream: Stream, hello: Hello, place: Place) -> Goodbye | None:
         """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
         self._stream, self._place = stream, place
+        self._has_resumed = True
         self._host.ledger.open(stream)
         self._host.audio.open(stream)
-        tasks = [
-            asyncio.create_task(self._read_incoming(stream, hello)),
-            asyncio.create_task(self._send_outgoing()),
-            asyncio.create_task(self._watch(stream)),
-        ]
+        reading = asyncio.create_task(self._read_incoming(stream, hello))
+        tasks = [reading, asyncio.create_task(self._send_outgoing()), asyncio.create_task(self._watch(stream))]
         access, caller = self._host.access, caller_of(self._websocket.scope)
         if access is not None and caller is not None:
             tasks.append(asyncio.create_task(_end_of_access(access, caller)))
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            has_gone = any(task.result() is None for task in done)
+            if has_gone and reading not in done:  # the sender noticed first; only the reader learns the close code
+                await asyncio.wait({reading}, timeout=_GOODBYE_S)
+            # If the client has gone, any reason to end the connection no longer matters.
+            ending = None if has_gone else next(iter(done)).result()
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+            if self._may_come_back(ending):
+                await self._keep(stream, place)
+            return ending
         finally:
             self._host.audio.close(stream)
             self._host.ledger.close(stream)
@@ -529,8 +668,37 @@ class Connection:
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
-        # If the client has gone, any reason to end the connection no longer matters.
-        return None if any(task.result() is None for task in done) else next(iter(done)).result()
+
+    def _may_come_back(self, ending: Goodbye | None) -> bool:
+        """Whether the client has neither said goodbye nor lost its stream by a fault."""
+        if ending is None:
+            return self._close_code not in GOODBYES
+        return ending not in (_FAILED, _ENDINGS["key_revoked"])
+
+    async def _keep(self, stream: Stream, place: Place) -> None:
+        """Keep the stream for its client to resume."""
+        if self._token is None:
+            return
+        state = await self._take_state(stream)
+        if state is None:
+            return
+        data = state.snapshot.model_dump_json().encode()
+        if len(data) > MOST_BYTES:
+            return
+        is_held = self._host.admission.keep(place)
+        self._host.kept.close(self._token, KeptStream(data, state.plays_s, place if is_held else None))
+
+    async def _take_state(self, stream: Stream) -> StreamState | None:
+        """The state of the stream after all messages that were passed on; None if its audio thread does not answer."""
+        self._state = asyncio.get_running_loop().create_future()
+        stream.offer(TakeSnapshot(self._session, self._handled))
+        try:
+            async with asyncio.timeout(_STATE_S):
+                return await self._state
+        except TimeoutError:
+            return None
+        finally:
+            self._state = None
 
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
         """Handle incoming messages until the client has gone."""
@@ -538,19 +706,21 @@ class Connection:
             emitters = self._host.settings.max_emitters
             self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=stream.sample_rate))
             self._fast_path.listen(self._handle_at_once)
-        with contextlib.suppress(WebSocketDisconnect):
+        try:
             while True:
                 data = await self._receive()
                 self._is_handling = True
                 await self._handle(data, stream, hello)
                 self._is_handling = False
+        except WebSocketDisconnect as gone:
+            self._close_code = gone.code
 
     def _handle_at_once(self, data: str | bytes) -> bool:
         """Handle a message that needs only the audio thread. Returns False, and does nothing, for any other message or
         while an earlier one is being handled."""
         if self._is_handling or self._stream is None:
             return False
-        message = None
+        message: ClientMessage | None = None
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter):
@@ -558,10 +728,11 @@ class Connection:
             self._pass_on(message, self._stream)
         except RequestError as refusal:
             self._refuse(refusal, message)
+        self._handled += _counts(message, data)
         return True
 
     async def _handle(self, data: str | bytes, stream: Stream, hello: Hello) -> None:
-        message = None
+        message: ClientMessage | None = None
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
@@ -571,6 +742,7 @@ class Connection:
             self._pass_on(message, stream)
         except RequestError as refusal:
             self._refuse(refusal, message)
+        self._handled += _counts(message, data)
 
     def _refuse(self, refusal: RequestError, message: ClientMessage | None) -> None:
         """Tell the client that a message was refused; None stands for one that could not be read."""
@@ -585,6 +757,9 @@ class Connection:
         if isinstance(message, DryPackets):
             assert self._live_decoders is not None
             message = self._live_decoders.decode(message)
+        elif not self._is_confirmed and isinstance(message, Acknowledge) and self._token is not None:
+            self._is_confirmed = True
+            self._host.kept.confirm(self._token)
         if not stream.offer(self._admitted(message, stream)):
             raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
 
@@ -607,7 +782,7 @@ class Connection:
                 steps = stream.steps(message.level)
                 refusal = admission.choose(place, steps)
                 if isinstance(refusal, int):
-                    return ChosenSteps(steps, refusal)
+                    return ChosenSteps(message.level, steps, refusal)
         if isinstance(refusal, Refusal):
             raise refusal.error
         return message
@@ -628,10 +803,12 @@ class Connection:
 
     def _deliver(self, outgoing: list[Outgoing]) -> None:
         """Send the audio thread's output, once it is encoded."""
+        if self._state is not None:
+            outgoing = list(self._without_state(outgoing))
         if self._block_encoding is None:
             self._send_or_queue(outgoing)
         elif not self._block_encoding.put(outgoing):
-            self._is_overfull.set()
+            self._end(_TOO_SLOW)
 
     def _send_or_queue(self, outgoing: list[Outgoing]) -> None:
         """Send output: blocks at once if there is a fast path and nothing waits to be sent."""
@@ -649,23 +826,37 @@ class Connection:
         if len(blocks) < len(outgoing):
             self._enqueue(outgoing[len(blocks) :])
 
-    def _enqueue(self, outgoing: list[Outgoing]) -> None:
+    def _without_state(self, outgoing: list[Outgoing]) -> Iterator[Outgoing]:
+        """The output less the state that was asked for, which is for this connection itself."""
+        for each in outgoing:
+            if not isinstance(each, StreamState):
+                yield each
+            elif self._state is not None and not self._state.done():
+                self._state.set_result(each)
+
+    def _end(self, goodbye: Goodbye) -> None:
+        """End the connection soon, for the first reason given."""
+        self._goodbye = self._goodbye or goodbye
+        self._is_ending.set()
+
+    def _enqueue(self, outgoing: Sequence[Outgoing]) -> None:
         """Queue messages for the sender. If there is no room, they are dropped and the connection ends."""
         if len(self._outgoing) + len(outgoing) > self._capacity:
-            self._is_overfull.set()
+            self._end(_TOO_SLOW)
             return
         self._outgoing += outgoing
         self._has_outgoing.set()
 
     async def _watch(self, stream: Stream) -> Goodbye:
-        """Return once the client reads too slowly or acknowledges nothing. This is separate from the sender, which may
-        itself wait for a client that does not read."""
+        """Return once the client reads too slowly, acknowledges nothing, or has another connection. This is separate
+        from the sender, which may itself wait for a client that does not read."""
         patience_s = left_s = self._host.settings.stall_timeout_s
         while left_s > 0:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(left_s):
-                    await self._is_overfull.wait()
-                    return _TOO_SLOW
+                    await self._is_ending.wait()
+                    assert self._goodbye is not None
+                    return self._goodbye
             left_s = patience_s - stream.stalled_s
         message = f"no block was acknowledged for {patience_s:g} s, and there is no room for more"
         return Goodbye(POLICY_VIOLATION, Error(code="stalled", message=message))
@@ -683,6 +874,8 @@ class Connection:
                             await self._websocket.send_bytes(self._serialize(timed, self._time_s()))
                         case StreamFailed():
                             return _FAILED
+                        case StreamState():  # it came too late
+                            continue
                         case message:
                             await self._send_message(message)
                 self._is_sending = False

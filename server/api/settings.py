@@ -166,6 +166,8 @@ class Settings(BaseSettings):
     longest."""
     stall_timeout_s: Annotated[float, Field(gt=0)] = 15.0
     """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
+    resume_s: Annotated[float, Field(ge=0, le=600)] = 15.0
+    """How long a stream whose connection was lost is kept for its client to resume it; 0 keeps none."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP computations that may wait for a thread; equal requests count once. Beyond that a client is answered 503."""
     drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0

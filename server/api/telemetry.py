@@ -15,6 +15,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from server.api.kept_streams import KeptStreams
 from server.api.stream_counts import StreamLedger, StreamTotals
 from server.assets.clips import ClipLibrary
 from server.core.durations import DurationHistogram
@@ -35,6 +36,9 @@ class Host(Protocol):
 
     @property
     def audio(self) -> AudioEngine: ...
+
+    @property
+    def kept(self) -> KeptStreams: ...
 
     @property
     def clips(self) -> Mapping[str, ClipLibrary]: ...
@@ -95,6 +99,7 @@ class ServerCollector(Collector):
         yield from self._audio_threads()
         yield self._level_costs()
         yield from _admission(self._host.admission)
+        yield from _kept(self._host.kept)
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
         yield GaugeMetricFamily(
@@ -225,6 +230,21 @@ def _admission(admission: Admission) -> Iterator[Metric]:
     for (asked, scarce), count in admission.refusals.items():
         refusals.add_metric([asked, scarce], count)
     yield refusals
+
+
+def _kept(streams: KeptStreams) -> Iterator[Metric]:
+    yield GaugeMetricFamily(
+        "nafir_streams_kept", "Streams that have lost their clients and wait for them.", value=len(streams)
+    )
+    outcomes = CounterMetricFamily(
+        "nafir_stream_resumptions",
+        "Streams that were kept after they lost their clients, were found by their tokens, or expired; and tokens that "
+        "were not known.",
+        labels=["outcome"],
+    )
+    for outcome, count in streams.outcomes.items():
+        outcomes.add_metric([outcome], count)
+    yield outcomes
 
 
 def _regrets(record: RegretRecord) -> Iterator[Metric]:

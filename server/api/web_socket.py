@@ -43,6 +43,7 @@ from server.api.resetting import reset
 from server.api.seats import Seat
 from server.api.turn_taking import TurnTaking
 from server.api.web_socket_frames import FrameSplitter, ReceivedFrame, header
+from server.protocol.codes import LOST
 
 Handler = Callable[[str | bytes], bool]
 """Handles a message at once. Returns False if it does not; the message then goes through ASGI."""
@@ -182,6 +183,9 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             self._seat.leave()
             self._leave_room()
             self._seat = self._leave_room = None  # these refer to the transport and to this protocol
+        if self.handshake_complete and not self.disconnected and self.conn.close_rcvd is None:
+            # uvicorn would say 1005, as for a close frame without a code.
+            self.queue.put_nowait({"type": "websocket.disconnect", "code": LOST})
         super().connection_lost(exc)
         if self._next_slice is not None:
             self._next_slice.cancel()

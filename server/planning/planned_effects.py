@@ -85,6 +85,11 @@ class PlannedEffects:
         self._seen: object = None
 
     @property
+    def wishes(self) -> dict[EffectName, bool]:
+        """The overrides by the listener."""
+        return dict(self._own)
+
+    @property
     def overrides(self) -> dict[EffectName, bool]:
         return {**self._scene, **self._own}
 

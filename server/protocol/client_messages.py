@@ -151,6 +151,19 @@ class Hello(Message):
         return 1 if self.order is None else self.order
 
 
+class Resume(Message):
+    """The first message of a client whose connection was lost, in place of a `hello`: the stream goes on, with its
+    emitters, clips, gains, level, effects and clock. `token` is that of the last `welcome`. `sequence` and
+    `sample_clock` are those of the last block that arrived: later blocks have greater ones. The answer is a `welcome`
+    with `resumed`, or the error `unknown_resume_token`, after which a `hello` begins anew."""
+
+    type: Literal["resume"] = "resume"
+    protocol: Integer
+    token: Annotated[str, Field(max_length=64)]
+    sequence: Annotated[int, Field(ge=0, lt=2**32), WHOLE] | None = None
+    sample_clock: Annotated[int, Field(ge=0, lt=2**62), WHOLE] | None = None
+
+
 class DirectivityPattern(Message):
     """How loud an emitter is in each direction, relative to its front. A pattern of the cardioid family is narrowed by
     `order`. A measured pattern has `gains_db`: seven octave bands from 125 Hz, each with one gain for each of
@@ -341,6 +354,7 @@ class Ping(Message):
 
 TextMessage = (
     Hello
+    | Resume
     | AddEmitter
     | MoveEmitter
     | StopEmitter
@@ -387,6 +401,13 @@ def parse_client_message(data: str | bytes) -> ClientMessage:
     return message
 
 
+def require_protocol(first: Hello | Resume) -> None:
+    """Raises RequestError for another version than this one."""
+    if first.protocol != PROTOCOL:
+        problem = f"this server speaks protocol {PROTOCOL}, not {first.protocol}"
+        raise RequestError("unsupported_protocol", problem, field="protocol")
+
+
 def _require_distinct_keys(data: str) -> None:
     try:
         require_distinct_keys(data)
@@ -395,13 +416,13 @@ def _require_distinct_keys(data: str) -> None:
 
 
 def _require_version(data: str) -> None:
-    """Raises RequestError for a hello of another version, or without one."""
+    """Raises RequestError for a hello or resume of another version, or without one."""
     try:
         # Python refuses to convert very long integers.
         hello = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
     except (ValueError, RecursionError):
         return
-    if not isinstance(hello, dict) or hello.get("type") != "hello":
+    if not isinstance(hello, dict) or hello.get("type") not in ("hello", "resume"):
         return
     version = hello.get("protocol")
     if isinstance(version, bool) or not isinstance(version, int | float) or version % 1 > 0:

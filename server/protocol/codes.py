@@ -5,8 +5,13 @@ from typing import Final
 
 NORMAL, POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1000, 1008, 1011, 1012, 1013
 """Close codes of RFC 6455, section 7.4.1, that the server uses."""
-ACCESS_ENDED = 4401
-"""A close code of our own (RFC 6455, 7.4.2): 401 for a stream that is open."""
+ACCESS_ENDED, TAKEN_OVER = 4401, 4409
+"""Close codes of our own (RFC 6455, 7.4.2): 401 and 409 for a stream that is open."""
+LOST = 1006
+"""What stands for the code of a connection that ended without a close frame."""
+GOODBYES: Final = frozenset({NORMAL, 1001, 1002, 1003, 1005, 1007, 1009})
+"""Close codes after which a client does not come back: it has said so (1005 stands for a close frame without a code),
+or broke the protocol. After any other the connection was lost."""
 
 ERROR_CODES: Final[Mapping[str, str]] = {
     "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",
@@ -16,6 +21,9 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "server_busy": "the stream, emitter, level or effect would break somebody's sound, or no stream is free; ask later",
     "hello_expected": "the first message was not a hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
+    "unexpected_resume": "a resume is the first message on a connection",
+    "unknown_resume_token": "no stream is kept for this token, or no longer; begin anew with a hello",
+    "taken_over": "the client has resumed the stream on another connection",
     "unsupported_protocol": "the server speaks another version of the protocol",
     "unsupported_sample_rate": "the scene is not rendered at this sample rate; the message lists those it is",
     "unsupported_encoding": "the server does not have the encoding, or not at this rate; GET /v1/encodings lists them",
@@ -63,5 +71,6 @@ CLOSE_CODES: Final[Mapping[int, str]] = {
     SERVICE_RESTART: "the server is shutting down",
     TRY_AGAIN_LATER: "the server is not ready, or has no room for the stream",
     ACCESS_ENDED: "the key or token that opened the stream has expired or was revoked",
+    TAKEN_OVER: "the client has resumed the stream on another connection",
 }
 """Meanings by close code. The web server itself closes with 1002, 1007 and 1009."""

@@ -54,12 +54,28 @@ class SceneDescription(Message):
     accepted_laws: tuple[AcceptedLaw, ...]
 
 
+class Resumed(Message):
+    """Where a stream goes on. The next block has this `sample_clock` and `sequence`. `pose_id` is the newest pose, of
+    listener or emitters, that had arrived before the connection was lost: send newer ones again. `handled` is how many
+    other messages had: of all text messages since the `hello` other than `listener`, `move_emitter`, `acknowledge` and
+    `ping`. Send those after them again."""
+
+    sample_clock: int
+    sequence: int
+    pose_id: int
+    handled: int
+
+
 class Welcome(Message):
-    """The answer to a valid hello. `window` is how many blocks may be unacknowledged before the server skips blocks.
-    `sample_rate` is that of the stream, `ir_samples` the length of its longest response. `level` is the first quality
-    level. `max_emitters` is how many emitters the stream may have at once. `order` is that of ambisonic channels;
-    streams of other outputs do not have it. `opus` says how to decode the encoding `opus`; streams of other encodings
-    do not have it."""
+    """The answer to a valid hello or resume. `window` is how many blocks may be unacknowledged before the server skips
+    blocks. `sample_rate` is that of the stream, `ir_samples` the length of its longest response. `level` is the first
+    quality level. `max_emitters` is how many emitters the stream may have at once. `order` is that of ambisonic
+    channels; streams of other outputs do not have it. `opus` says how to decode the encoding `opus`; streams of other
+    encodings do not have it.
+
+    With `resume_token` a client resumes the stream within `resume_s` seconds after its connection is lost. Keep it
+    secret: whoever has it can take the stream over. `resumed` says where a resumed stream goes on; a new one does not
+    have it, and `session` is the same."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Literal[3] = PROTOCOL
@@ -75,6 +91,9 @@ class Welcome(Message):
     hrtf: str
     level: str
     max_emitters: int | None = None
+    resume_token: Annotated[str | None, Field(exclude_if=lambda token: token is None)] = None
+    resume_s: Annotated[float | None, Field(exclude_if=lambda seconds: seconds is None)] = None
+    resumed: Annotated[Resumed | None, Field(exclude_if=lambda resumed: resumed is None)] = None
     order: Annotated[int | None, Field(exclude_if=lambda order: order is None)] = None
     opus: Annotated[OpusStreams | None, Field(exclude_if=lambda opus: opus is None)] = None
 

@@ -65,6 +65,8 @@ class _Emitter:
     slot: int
     source: Source
     awaits_ir: bool
+    since: int | None = None
+    """The sample clock at which the source began, if that was in an earlier renderer."""
     token: int | None = None
     next_token: int | None = None
     send: float = 1.0
@@ -244,12 +246,25 @@ class Renderer:
         has rung out."""
         return channels == self._mixer.channels or self._mixers.is_free(channels)
 
-    def add_emitter(self, emitter_id: str, source: Source, *, gain: float = 1.0, awaits_ir: bool = True) -> None:
+    def skip_to(self, sample_clock: int) -> None:
+        """Set the clock of a renderer that has rendered nothing yet, to a whole number of blocks."""
+        self._blocks_rendered = sample_clock // self.block_size
+
+    def add_emitter(
+        self,
+        emitter_id: str,
+        source: Source,
+        *,
+        gain: float = 1.0,
+        awaits_ir: bool = True,
+        since: int | None = None,
+    ) -> None:
         """Add an emitter that plays `source`, scaled by `gain` (linear amplitude, within `LOUDEST_GAIN`).
 
         With `awaits_ir` it is silent and its source waits until it has an IR; where direct paths are rendered, it also
-        waits for a path. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain that would
-        overflow.
+        waits for a path. A source that began at an earlier clock, `since`, does not begin anew: it fades in over a
+        block, where it would be by then. Raises DuplicateEmitterError, RendererFullError, and ValueError for a gain
+        that would overflow.
         """
         # guard: a refused gain leaves no emitter behind
         require_gain(gain)
@@ -262,7 +277,7 @@ class Renderer:
         slot = self._mixer.take_slot()
         if slot is None:
             raise RendererFullError("too many emitters removed just now still ring out")
-        self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir)
+        self._emitters[emitter_id] = _Emitter(self._mixer, slot, source, awaits_ir, since)
         # guard: an emitter begins at its gain
         self._mixer.set_gain(slot, gain)
         self._mixer.send[:, slot] = 1.0
@@ -428,11 +443,19 @@ class Renderer:
                 emitter.token = emitter.next_token
                 if not emitter.has_played:
                     emitter.has_played = True
-                    if is_read_by_compiled_code(emitter.source):
-                        emitter.source.begin(self.sample_clock)
+                    self._start(emitter)
                     emitter.mixer.play(emitter.slot, emitter.source)
         self._changed.clear()
         return self._output, list(self._mixers)
+
+    def _start(self, emitter: _Emitter) -> None:
+        """Tell a source the clock at which it begins, or has begun."""
+        since = self.sample_clock if emitter.since is None else emitter.since
+        if is_read_by_compiled_code(emitter.source):
+            emitter.source.begin(since)
+        if emitter.since is not None:
+            emitter.source.skip(max(0, self.sample_clock - since))
+            emitter.mixer.gain[0, emitter.slot] = 0.0
 
     def _finish(self, blocks: Sequence[Rendered]) -> None:
         """Free everything that has rung out."""

@@ -26,6 +26,9 @@ class Source(Protocol):
     def process(self, out: FloatArray) -> None:
         """Fill `out` (b,) with the next samples."""
 
+    def skip(self, samples: int) -> None:
+        """Go on as if `samples`, >= 0, had been played before the next block."""
+
     def reset(self) -> None:
         """Start again from the beginning."""
 
@@ -133,6 +136,19 @@ class ClipPlayer:
                 at = int(record["loop_start"])
         record["at"] = at
 
+    def skip(self, samples: int) -> None:
+        """Go on as if `samples` had been played before the next block."""
+        record = self.playback
+        at, end, start = int(record["at"]), int(record["loop_end"]), int(record["loop_start"])
+        at += max(0, samples - max(0, int(record["starts_in"])))
+        if not end:
+            at = min(at, self.clip.size)
+        elif at >= end:
+            at = start + (at - end) % (end - start)
+        record["at"] = at
+        record["starts_in"] -= samples
+        record["stops_in"] -= samples
+
     def reset(self) -> None:
         self.playback["at"] = self._offset
         self.begin(0)
@@ -188,9 +204,13 @@ class LiveSource:
         self.samples_dropped = 0
         self.samples_gated = 0
         self._read = 0
-        self._is_playing = False
+        self._is_playing = self._fades_in = False
         self._waits_for = self._lead
         self._overtaken: FloatArray | None = None  # the samples that would have come next, had they not been dropped
+
+    def skip(self, _samples: int) -> None:
+        """Fade in with the first sample that is played: those before it were not."""
+        self._fades_in = True
 
     def push(self, samples: FloatArray) -> None:
         """Queue samples (n,) from a client."""
@@ -231,7 +251,7 @@ class LiveSource:
             self._drop(self.queued - wanted)
         self._is_playing = True
         self._take(out)
-        if self.underruns:
+        if self.underruns or self._fades_in:
             out[:FADE_SAMPLES] *= self._fade_in
 
     def _run_dry(self, out: FloatArray) -> None:

@@ -58,6 +58,9 @@ _WHY: Final[dict[Scarce, str]] = {
 }
 _REQUEST: Final = "request", "computations"
 """How HTTP requests are counted for whose computation there is no room."""
+_HELD_SHARE: Final = 8
+"""For so many open streams one place may be held for a stream that has lost its client. So losing connections on
+purpose keeps nobody out."""
 _SHOWN_EMITTERS = 16
 """Streams that came last, by which it is judged how many emitters the next will have."""
 
@@ -93,6 +96,8 @@ class Place:
     until_s: float
     is_live: bool = False
     stream: Stream | None = None
+    is_kept: bool = False
+    """Whether its stream has lost its client, who may come back."""
     is_asked: bool = False
     """Whether `step` is one that its stream asks for, and not the one on which it is."""
 
@@ -155,6 +160,11 @@ class Admission:
     def streams(self) -> int:
         """The number of places that are taken."""
         return len(self._places)
+
+    @property
+    def held(self) -> int:
+        """The number of places that are held for streams that have lost their clients."""
+        return sum(place.is_kept for place in self._places)
 
     async def run(self) -> None:
         """Measure four times a second until cancelled."""
@@ -265,9 +275,24 @@ class Admission:
 
     def open(self, place: Place, stream: Stream) -> None:
         """Note that the stream of a place begins, before the engine opens it."""
-        place.stream, place.until_s = stream, self._time_s() + self._limits.reserved_s
+        place.stream, place.is_kept, place.until_s = stream, False, self._time_s() + self._limits.reserved_s
         self._by_stream[stream] = place
         stream.expected_load = self._expected(place, place.reserved).rendering if place.kind else 0.0
+
+    def keep(self, place: Place) -> bool:
+        """Hold the place of a stream that has lost its client, with what the stream is expected to cost. Return False,
+        and give the place back, if too many are held."""
+        stream = place.stream
+        if stream is None or self.held >= len(self._by_stream) // _HELD_SHARE:
+            self.leave(place)
+            return False
+        place.emitters = stream.session.emitter_count
+        place.reserved, place.until_s = max(1, place.emitters), math.inf
+        place.step, place.is_top, place.is_asked = place.now_on, place.is_on_top, False
+        place.thread = self._thread_of(stream)
+        place.stream, place.is_kept = None, True
+        del self._by_stream[stream]
+        return True
 
     def leave(self, place: Place) -> None:
         """Give a place back. A second call changes nothing."""
@@ -276,6 +301,7 @@ class Admission:
         del self._places[place]
         if place.stream is not None:
             del self._by_stream[place.stream]
+        if place.stream is not None or place.is_kept:
             self._endings_s.append(self._time_s())
             self._emitters.append(max(1, place.emitters))
 

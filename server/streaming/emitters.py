@@ -12,8 +12,9 @@ from server.core.errors import RequestError
 from server.field.lattice import Neighbourhood
 from server.planning.catalogue import EVERYTHING
 from server.protocol.blocks import DryBlock
-from server.protocol.client_messages import AddEmitter, MoveEmitter
+from server.protocol.client_messages import AddEmitter, MoveEmitter, StopEmitter
 from server.protocol.server_messages import LiveStatus
+from server.protocol.snapshot import KeptEmitter
 from server.rendering.convolver import PartitionedIr
 from server.rendering.sources import LiveSource
 from server.responses.effect_flags import EmitterEffects
@@ -98,6 +99,8 @@ class StreamedEmitter:
 
     serial: int
     state: EmitterState
+    added: AddEmitter | None = None
+    """The client's message that added it; None outside streams."""
     live: "LiveInput | None" = None
     stage: Stage = Stage.DECIDED
     heard: HeardResponse = field(default_factory=HeardResponse)
@@ -112,21 +115,52 @@ class StreamedEmitter:
     """Whether it will have been heard to its end some time, of which the client is not informed yet."""
     remove_when_ended: bool = False
     ramp: "Ramp | None" = None
+    since: int | None = None
+    """The sample clock since which it is audible; None before."""
+    stop: StopEmitter | None = None
+    """When the client has its clip stop, and how; None if it has not said so since it added the emitter."""
 
     @classmethod
     def added_by(
-        cls, message: AddEmitter, serial: int, live: "LiveInput | None", stage: Stage = Stage.DECIDED
+        cls,
+        message: AddEmitter,
+        serial: int,
+        live: "LiveInput | None",
+        stage: Stage = Stage.DECIDED,
+        *,
+        since: int | None = None,
     ) -> "StreamedEmitter":
         pattern = OMNIDIRECTIONAL if message.directivity is None else message.directivity.directivity
         state = EmitterState(message.pose, pattern, EVERYTHING, message.gain_db)
         return cls(
             serial,
             state,
+            message,
             live,
             stage,
             starts_at=message.start_at or 0,
             ends=live is None and (not message.loop or message.stop_at is not None),
             remove_when_ended=message.remove_when_ended,
+            since=since,
+        )
+
+    def kept(self) -> KeptEmitter:
+        """Return what an emitter like this one, at its present place, is made of. A gain on its way is there. Not
+        validated, since this runs on the audio thread."""
+        assert self.added is not None, "no message has added it"
+        now = {
+            "position": self.state.position,
+            "orientation": self.state.pose.orientation,
+            "yaw": None,
+            "gain_db": self.state.gain_db if self.ramp is None else self.ramp.gain_db,
+        }
+        given = {name: getattr(self.added, name) for name in AddEmitter.model_fields}
+        return KeptEmitter.model_construct(
+            emitter=AddEmitter.model_construct(**{**given, **now}),
+            since=self.since,
+            stop=self.stop,
+            ends=self.ends,
+            newest_block=-1 if self.live is None else self.live.newest_sequence,
         )
 
     @property
@@ -148,9 +182,13 @@ class StreamedEmitter:
         if self.stage is Stage.UNDECIDED:
             self.stage = Stage.DECIDED
 
-    def announce(self) -> bool:
-        """Note that the client is informed. Return whether that still has to be done."""
-        is_news, self.stage = self.stage is not Stage.ANNOUNCED, Stage.ANNOUNCED
+    def announce(self, sample_clock: int) -> bool:
+        """Note that it is heard from this clock on, unless it was before. Return whether to tell the client, which
+        knows of an emitter that was heard in the stream before it was resumed."""
+        is_news = self.stage is not Stage.ANNOUNCED and self.since is None
+        self.stage = Stage.ANNOUNCED
+        if self.since is None:
+            self.since = sample_clock
         return is_news
 
     def move(self, message: MoveEmitter) -> None:
@@ -170,6 +208,15 @@ class StreamedEmitter:
         """Note the gain of a ramp that has ended by `clock`."""
         if self.ramp is not None and self.ramp.ends_at <= clock:
             self.set_gain(self.ramp.gain_db)
+
+    def note_stop(self, message: StopEmitter, clock: int) -> None:
+        """Note that its clip is to stop, by a message that comes at this clock. Once the fade has begun no other
+        counts."""
+        assert self.added is not None, "no message has added it"
+        before = self.added.stop_at if self.stop is None else self.stop.stop_at
+        if before is None or before >= clock:
+            at = clock if message.stop_at is None else max(clock, message.stop_at)
+            self.stop = message.model_copy(update={"stop_at": at})
 
     def set_effects(self, effects: EmitterEffects) -> None:
         self.state = replace(self.state, effects=effects)

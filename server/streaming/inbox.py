@@ -22,10 +22,22 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ChosenSteps:
-    """A client's choice of a quality level: its steps, and the number of the one to begin on."""
+    """A client's choice of a quality level: its name, its steps, and the number of the one to begin on."""
 
+    level: str
     steps: tuple[QualityStep, ...]
     at: int
+
+
+@dataclass(frozen=True)
+class TakeSnapshot:
+    """Asks for the state of a stream after all earlier messages, of which `handled` count (`Snapshot.handled`)."""
+
+    session: str
+    handled: int
+
+
+StreamMessage = ClientMessage | ChosenSteps | TakeSnapshot
 
 
 @dataclass(frozen=True)
@@ -46,19 +58,23 @@ class Inbox:
         self.regrets: deque[Regret | BaseException] = deque()
         self.brings_emitter = False
         """Whether a waiting message adds an emitter."""
-        self._messages: deque[tuple[float, ClientMessage | ChosenSteps]] = deque()
+        self.asks_for_state = False
+        """Whether a waiting message asks for the stream's state."""
+        self._messages: deque[tuple[float, StreamMessage]] = deque()
 
-    def put_message(self, message: ClientMessage | ChosenSteps, now_s: float) -> bool:
-        """Queue a message; return False, and refuse it, if too many are waiting. A listener's pose replaces an older
-        one directly before it, and counts from when that one arrived: the listener has waited since then."""
+    def put_message(self, message: StreamMessage, now_s: float) -> bool:
+        """Queue a message; return False, and refuse it, if too many of the client's are waiting. A listener's pose
+        replaces an older one directly before it, and counts from when that one arrived: the listener has waited since
+        then."""
         if not self._replace_pose(message):
-            if len(self._messages) >= MAX_WAITING_MESSAGES:
+            if len(self._messages) >= MAX_WAITING_MESSAGES and not isinstance(message, TakeSnapshot):
                 return False
             self._messages.append((now_s, message))
         self.brings_emitter |= isinstance(message, AddEmitter)
+        self.asks_for_state |= isinstance(message, TakeSnapshot)
         return True
 
-    def _replace_pose(self, message: ClientMessage | ChosenSteps) -> bool:
+    def _replace_pose(self, message: StreamMessage) -> bool:
         if not (isinstance(message, ListenerPose) and self._messages):
             return False
         try:
@@ -80,7 +96,7 @@ class Inbox:
         """Whether a response or a plan has arrived, which is processed before the next block."""
         return bool(self.responses or self.plans)
 
-    def take_messages(self) -> Iterator[tuple[float, ClientMessage | ChosenSteps]]:
+    def take_messages(self) -> Iterator[tuple[float, StreamMessage]]:
         """Take the messages that wait now, each with its time of arrival."""
         for _ in range(len(self._messages)):
             yield self._messages.popleft()

@@ -39,14 +39,15 @@ class StreamClock:
 
 
 class SendWindow:
-    """A limit of `size` blocks that are sent and not yet acknowledged.
+    """A limit of `size` blocks that are sent and not yet acknowledged; the first one has the number `first`.
 
     Awaiting a socket does not show what the client has: seconds of audio fit in the buffers between. Acknowledgements
     do.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, first: int = 0) -> None:
         self.size = size
+        self.first = first
         self.sent = 0
         self._acknowledged = 0
 
@@ -58,16 +59,20 @@ class SendWindow:
     def is_full(self) -> bool:
         return self.unacknowledged >= self.size
 
+    @property
+    def next_sequence(self) -> int:
+        return self.first + self.sent
+
     def take_sequences(self, blocks: int) -> range:
         """Return the sequence numbers of the next `blocks`, or of as many of them as the window has room for."""
-        first = self.sent
+        first = self.next_sequence
         self.sent += max(0, min(blocks, self.size - self.unacknowledged))
-        return range(first, self.sent)
+        return range(first, self.next_sequence)
 
     def acknowledge(self, sequence: int) -> None:
         """Note that blocks up to and including `sequence` arrived. Raises RequestError for one that was never sent."""
         # guard: what was not sent cannot have arrived
-        if sequence >= self.sent:
+        if sequence >= self.next_sequence:
             raise RequestError("unknown_sequence", f"block {sequence} has not been sent yet", field="sequence")
         # guard: who acknowledges late takes nothing back
-        self._acknowledged = max(self._acknowledged, sequence + 1)
+        self._acknowledged = max(self._acknowledged, sequence + 1 - self.first)

@@ -140,6 +140,10 @@ class ResponseScheduler:
         """Set the least time between requests; an emitter that waits for its first IR is not affected."""
         self._interval_s = interval_s
 
+    def continue_from(self, pose_id: int) -> None:
+        """Begin with this pose as the newest one, before any other."""
+        self.newest_pose_id = self.applied_pose_id = self._accepted_pose_id = pose_id
+
     def advance(self, pose_id: int) -> None:
         """Note a new pose of the listener or of an emitter. Raises RequestError if a newer one came before."""
         # guard: an old pose is refused
@@ -332,7 +336,7 @@ class ResponseScheduler:
     def _announce(self, identifiers: Iterable[str]) -> list[ServerMessage]:
         """Return messages that these emitters are audible from the next block on, for those not announced before."""
         clock = self._renderer.sample_clock
-        news = [identifier for identifier in identifiers if self._emitters[identifier].announce()]
+        news = [identifier for identifier in identifiers if self._emitters[identifier].announce(clock)]
         return [
             EmitterAdded(id=identifier, sample_clock=max(clock, self._emitters[identifier].starts_at))
             for identifier in news

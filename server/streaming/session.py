@@ -24,18 +24,19 @@ from server.planning.planned_effects import PlannedEffects, PlanRequest
 from server.planning.scene_acoustics import SceneAcoustics
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
-    PROTOCOL,
     Acknowledge,
     AddEmitter,
     ClientMessage,
     Hello,
     ListenerPose,
+    ListenerStart,
     MoveEmitter,
     RemoveEmitter,
     SetEffects,
     SetGain,
     StopEmitter,
     emitter_of,
+    require_protocol,
 )
 from server.protocol.server_messages import (
     EmitterEnded,
@@ -46,6 +47,7 @@ from server.protocol.server_messages import (
     PlanChanged,
     ServerMessage,
 )
+from server.protocol.snapshot import KeptEmitter, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.rendering.output import Rendered
@@ -73,13 +75,6 @@ def _start_pose(bundle: Bundle) -> Pose:
     return Pose.from_yaw(start.listener, math.radians(start.listener_yaw_deg))
 
 
-def _require_served(hello: Hello) -> None:
-    """Raises RequestError for an unknown protocol."""
-    if hello.protocol != PROTOCOL:
-        problem = f"this server speaks protocol {PROTOCOL}, not {hello.protocol}"
-        raise RequestError("unsupported_protocol", problem, field="protocol")
-
-
 class Session:
     """The state of one client's stream: poses, emitters, a renderer and the window of unacknowledged blocks.
 
@@ -105,7 +100,7 @@ class Session:
         costs: Callable[[int | None], Costs] = lambda _: {},
         field_filters: HeadFilters | None = None,
     ) -> None:
-        _require_served(hello)
+        require_protocol(hello)
         levels = levels.at_rate(hello.sample_rate)
         field = levels.default
         if filters.sample_rate != field.sample_rate:
@@ -113,9 +108,12 @@ class Session:
                 f"the head is filtered for {filters.sample_rate} Hz, the stream for {field.sample_rate} Hz"
             )
         self.window = SendWindow(window)
+        self.chosen_level = hello.level
+        """The level that the client chose last."""
         self.ir_exchanges = 0
         self.blocks_dropped = 0
         self.blocks_limited = 0
+        self._hello = hello
         self._bundle = levels.bundle
         self._sample_rate = field.sample_rate
         self._load_clip = load_clip
@@ -352,6 +350,61 @@ class Session:
         refusals = {name: emitter.live.complaint() for name, emitter in self._emitters.items() if emitter.live}
         return [Error.from_refusal(refusal, name) for name, refusal in refusals.items() if refusal]
 
+    def snapshot(self, *, session: str, handled: int) -> Snapshot:
+        """Return the state before the next block. Not validated, since this runs on the audio thread."""
+        planned = self._effects.planned
+        now = {
+            "listener": ListenerStart.model_construct(
+                position=self._listener.position, orientation=self._listener.orientation, yaw=None
+            ),
+            "level": self.chosen_level,
+            "output": self._output,
+            "emitters": len(self._emitters),
+        }
+        if planned is not None:
+            now["effects"] = {name.value: is_on for name, is_on in planned.wishes.items()}
+        given = {name: getattr(self._hello, name) for name in Hello.model_fields}
+        return Snapshot.model_construct(
+            session=session,
+            hello=Hello.model_construct(**{**given, **now}),
+            sample_clock=self.sample_clock,
+            sequence=self.window.next_sequence,
+            pose_id=self._responses.newest_pose_id,
+            handled=handled,
+            emitters=tuple(emitter.kept() for emitter in self._emitters.values()),
+        )
+
+    def restore(self, snapshot: Snapshot) -> list[ServerMessage]:
+        """Continue a stream as `snapshot` has it, in a new session for its hello. Return an `Error` for each emitter
+        that cannot be had here."""
+        self._responses.continue_from(snapshot.pose_id)
+        self._followed_pose_id = snapshot.pose_id
+        self.continue_at(snapshot.sample_clock, snapshot.sequence)
+        errors: list[ServerMessage] = []
+        for kept in snapshot.emitters:
+            try:
+                self._restore_emitter(kept)
+            except RequestError as refusal:
+                errors.append(Error.from_refusal(refusal, kept.emitter.id))
+        return errors
+
+    def _restore_emitter(self, kept: KeptEmitter) -> None:
+        self._add_emitter(kept.emitter, since=kept.since)
+        identifier = kept.emitter.id
+        emitter = self._emitters[identifier]
+        if emitter.live is not None:
+            emitter.live.newest_sequence = kept.newest_block
+        elif kept.stop is not None and kept.stop.stop_at is not None:
+            emitter.stop = kept.stop
+            self.renderer.stop_emitter(identifier, kept.stop.stop_at, fade=self._fade_samples(kept.stop))
+        emitter.ends = kept.ends
+
+    def continue_at(self, sample_clock: int, sequence: int) -> None:
+        """Set the clock and the number of the first block, before it is rendered. What began at an earlier clock is
+        then where it would be."""
+        self.renderer.skip_to(sample_clock)
+        self.window = SendWindow(self.window.size, sequence)
+
     def _follow(self, identifier: str, emitter: StreamedEmitter) -> None:
         if self._effects.planned is not None:
             self._effects.planned.follow_emitter(identifier, emitter.state.pose, self._effects.clock_s)
@@ -393,20 +446,20 @@ class Session:
         self._effects.unbake(message.id, emitter)
         self._follow(message.id, emitter)
 
-    def _add_emitter(self, message: AddEmitter) -> None:
+    def _add_emitter(self, message: AddEmitter, *, since: int | None = None) -> None:
         self._bundle.require_inside(message.position, "position")
         if self._bundle.manifest.direct_sound == "field" and message.directivity is not None:
             problem = f"scene {self._bundle.id} holds the direct sound, with how its emitters beamed; leave it out"
             raise RequestError("fixed_directivity", problem, field="directivity")
         live, source = self._open_source(message)
         try:
-            self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)))
+            self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)), since=since)
         except DuplicateEmitterError as exc:
             raise RequestError("duplicate_emitter", f"emitter {message.id!r} is already there", field="id") from exc
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
         stage = Stage.DECIDED if self._effects.planned is None else Stage.UNDECIDED
-        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage)
+        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage, since=since)
         if emitter.state.directivity != OMNIDIRECTIONAL:
             self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.state.directivity))
         self._emitters[message.id] = emitter
@@ -461,8 +514,12 @@ class Session:
         if emitter.live is not None:
             raise RequestError("is_live", f"emitter {message.id!r} is live: remove it", field="id")
         clock = self.sample_clock if message.stop_at is None else message.stop_at
-        self.renderer.stop_emitter(message.id, clock, fade=max(1, round(message.fade_s * self._sample_rate)))
+        self.renderer.stop_emitter(message.id, clock, fade=self._fade_samples(message))
+        emitter.note_stop(message, self.sample_clock)
         emitter.ends |= not self.renderer.has_ended(message.id)
+
+    def _fade_samples(self, message: StopEmitter) -> int:
+        return max(1, round(message.fade_s * self._sample_rate))
 
     def _push(self, block: DryBlock) -> None:
         live = self._require_emitter(block.id).live

@@ -18,12 +18,13 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.plan import Plan
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock, Packets
-from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose, MoveEmitter, SetLevel
+from server.protocol.client_messages import AddEmitter, ListenerPose, MoveEmitter, SetLevel
 from server.protocol.server_messages import Durations, Error, LevelReason, ServerMessage, Status
+from server.protocol.snapshot import Snapshot
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
-from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, PendingWork
+from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, PendingWork, StreamMessage, TakeSnapshot
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
@@ -59,7 +60,16 @@ class StreamFailed:
     """A message that rendering failed: no more output comes from this stream."""
 
 
-Outgoing = ServerMessage | TimedBlock | StreamFailed
+@dataclass(frozen=True)
+class StreamState:
+    """The state of a stream whose next block plays at `plays_s` of the audio engine's clock. It is not sent as it
+    is."""
+
+    snapshot: Snapshot
+    plays_s: float
+
+
+Outgoing = ServerMessage | TimedBlock | StreamFailed | StreamState
 
 
 @dataclass
@@ -193,8 +203,9 @@ class Stream:
         """Return the quality steps of a level, or of auto. Raises RequestError unknown_level."""
         return self._offer.steps(level, block_s=self.block_s)
 
-    def offer(self, message: ClientMessage | ChosenSteps) -> bool:
-        """Queue a message for the audio thread; return False, and refuse it, if too many are waiting.
+    def offer(self, message: StreamMessage) -> bool:
+        """Queue a message for the audio thread; return False, and refuse it, if too many are waiting. TakeSnapshot is
+        never refused, and answered by a StreamState.
 
         A message that calls for an impulse response, if one can be requested now, wakes the thread; all others wait for
         the next block.
@@ -203,7 +214,9 @@ class Stream:
             return False
         # While a request is unanswered there is no other, and the answer wakes the thread too.
         asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
-        if asks or self._pause.is_paused:  # a paused stream has no blocks that would wake the thread
+        if (
+            asks or self._inbox.asks_for_state or self._pause.is_paused
+        ):  # a paused stream has no blocks that would wake the thread
             self._wake()
         return True
 
@@ -234,9 +247,9 @@ class Stream:
 
     @property
     def has_news(self) -> bool:
-        """Whether an item in the inbox cannot wait for the next block: an answer, or a message that lets an IR be
-        requested."""
-        is_urgent = self._pause.is_paused or self._asks_at_once
+        """Whether an item in the inbox cannot wait for the next block: an answer, or a message that asks for the state
+        or lets an IR be requested."""
+        is_urgent = self._pause.is_paused or self._inbox.asks_for_state or self._asks_at_once
         return self._inbox.has_answers or (self._inbox.has_messages and is_urgent)
 
     @property
@@ -253,12 +266,15 @@ class Stream:
         """Process the inbox and request impulse responses; if it is not the stream's turn, set `wants_turn`."""
         outgoing: list[Outgoing] = []
         inbox = self._inbox
-        inbox.brings_emitter = False
+        inbox.brings_emitter = inbox.asks_for_state = False
         while inbox.responses:
             outgoing += self._take_answer(*inbox.responses.popleft())
         while inbox.plans:
             outgoing += self._take_plan(inbox.plans.popleft())
         for arrived_s, message in inbox.take_messages():
+            if isinstance(message, TakeSnapshot):
+                outgoing.append(self._state(message))
+                continue
             if isinstance(message, SetLevel | ChosenSteps):
                 refused = self._choose(message)
             else:
@@ -392,12 +408,19 @@ class Stream:
     def _choose(self, chosen: SetLevel | ChosenSteps) -> list[ServerMessage]:
         """Change to the first step of a level, or to the step that was chosen for it."""
         try:
-            at = chosen if isinstance(chosen, ChosenSteps) else ChosenSteps(self.steps(chosen.level), 0)
+            if isinstance(chosen, SetLevel):
+                chosen = ChosenSteps(chosen.level, self.steps(chosen.level), 0)
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
-        self.ladder = Ladder(at.steps, at.at)
+        self.ladder = Ladder(chosen.steps, chosen.at)
+        self.session.chosen_level = chosen.level
         self._wait.restart(self._time_s())
         return self.session.set_quality(self.ladder.step, "chosen")
+
+    def _state(self, asked: TakeSnapshot) -> StreamState:
+        # In a pause the clock stands still, while the sound that is lost would have gone on.
+        snapshot = self.session.snapshot(session=asked.session, handled=asked.handled)
+        return StreamState(snapshot, self.deadline_s)
 
     def _keep_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> None:
         self._inbox.responses.append((request, computed))

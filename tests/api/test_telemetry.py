@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from server.api.kept_streams import KeptStreams
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector, exposition
 from server.core.durations import DurationHistogram
@@ -33,6 +34,7 @@ class Host:
         self.refused_bundles = 0
         self.ledger = StreamLedger()
         self.admission = Admission(audio, most_streams=1, cores=2)
+        self.kept = KeptStreams(keep_s=1.0, most=1, give_up=self.admission.leave)
         self.readiness = Readiness(Drain(8.0), ThreadWatch((audio,)), warm_up="done")
 
 

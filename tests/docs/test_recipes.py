@@ -26,7 +26,8 @@ def modules_with(*texts: str) -> set[str]:
 
 def test_every_message_for_a_game_is_one() -> None:
     messages = [parse_client_message(text) for text in blocks("how-to/play-from-a-game.md", "json")]
-    assert [message.type for message in messages] == ["hello", *2 * ["add_emitter"], "acknowledge", "listener", "hello"]
+    types = ["hello", *2 * ["add_emitter"], "acknowledge", "listener", "hello", "resume"]
+    assert [message.type for message in messages] == types
 
 
 def test_a_game_may_turn_its_axes_as_the_recipe_says() -> None:

@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from server.api.app import create_app
+from server.api.kept_streams import KeptStreams
 from server.api.problem_codes import PROBLEM_CODES
 from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
@@ -131,6 +132,7 @@ class Host:
         self.audio = AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0)
         self.ledger = StreamLedger()
         self.admission = Admission(self.audio, most_streams=1, cores=2)
+        self.kept = KeptStreams(keep_s=1.0, most=1, give_up=self.admission.leave)
         self.readiness = Readiness(Drain(8.0), ThreadWatch((self.audio,)), warm_up="done")
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}

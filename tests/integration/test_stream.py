@@ -66,5 +66,6 @@ def test_a_client_that_vanishes_leaves_no_stream_behind(served):
     for _ in range(70):  # more than the server has streams
         with connect(f"ws://{served}/v1/stream") as client:
             client.send(HELLO)
-            assert json.loads(client.recv(timeout=5))["type"] == "welcome"
+            said = json.loads(client.recv(timeout=5))
+            assert said["type"] == "welcome", said
             client.socket.shutdown(socket.SHUT_RDWR)

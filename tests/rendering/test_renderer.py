@@ -396,3 +396,28 @@ def test_rendering_leaves_the_interpreter_to_others():
     counted.append(-1)
     thread.join()
     assert during >= 3
+
+
+@pytest.mark.parametrize("loop", [True, False])
+def test_an_emitter_that_began_before_fades_in_where_it_would_be(loop):
+    """In a renderer that begins at a later clock, and only after some blocks, as a response takes its time."""
+    clip, blocks, late, clock = noise(0, 900), 60, 4, 10 * SIZE
+    whole, resumed = renderer(), renderer()
+    resumed.skip_to(clock)
+    assert resumed.sample_clock == clock
+    for engine, since in ((whole, None), (resumed, SIZE)):
+        engine.add_emitter("a", ClipPlayer(clip, loop=loop), since=since)
+    run(whole, 1)
+    whole.set_ir("a", room(1))
+    expected = run(whole, blocks)[:, clock - SIZE :]
+    assert not run(resumed, late).any()
+    resumed.set_ir("a", room(1))
+    heard = run(resumed, blocks - late - 9)
+    played = np.resize(clip, blocks * SIZE) if loop else np.pad(clip, (0, blocks * SIZE))[: blocks * SIZE]
+    played[: clock - SIZE + late * SIZE] = 0
+    played[clock - SIZE + late * SIZE :][:SIZE] *= raised_cosine(SIZE)
+    own = convolve(played, room(1), blocks * SIZE)[:, clock - SIZE + late * SIZE :]
+    assert error_db(heard, own[:, : heard.shape[1]]) < -120
+    rung_in = IR_SAMPLES + SIZE
+    same = expected[:, late * SIZE + rung_in :][:, : heard.shape[1] - rung_in]
+    assert np.abs(heard[:, rung_in:] - same).max() < 1e-5

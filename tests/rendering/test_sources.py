@@ -37,6 +37,30 @@ def test_player_starts_over_after_reset():
     np.testing.assert_array_equal(first, again)
 
 
+@given(
+    skipped=st.integers(0, 1_000),
+    played=st.integers(0, 150),
+    loop=st.booleans(),
+    offset=st.sampled_from([0, 30, 80]),
+    starts_at=st.integers(0, 300),
+    stops_at=st.none() | st.integers(0, 1_200),
+)
+def test_a_clip_that_skips_goes_on_as_if_it_had_played(skipped, played, loop, offset, starts_at, stops_at):
+    clip = 1 + np.arange(97, dtype=np.float32)
+    loops = {"loop_start": 11, "loop_end": 90} if loop else {}
+    player, whole = (ClipPlayer(clip, loop=loop, offset=offset, starts_at=starts_at, **loops) for _ in range(2))
+    for each in (player, whole):
+        if stops_at is not None:
+            each.stop(stops_at, 50)
+        each.begin(0)
+    before, after, expected = np.empty(played, np.float32), np.empty(120, np.float32), np.empty(played + skipped + 120)
+    player.process(before)
+    player.skip(skipped)
+    player.process(after)
+    whole.process(expected)
+    np.testing.assert_allclose(after, expected[-120:], rtol=1e-6)
+
+
 @pytest.mark.parametrize("clip", [np.zeros(0, np.float32), np.zeros((2, 10), np.float32)])
 def test_a_clip_that_cannot_be_played_is_refused(clip):
     with pytest.raises(ValueError, match="mono"):
@@ -87,6 +111,16 @@ def test_nothing_is_played_until_the_lead_waits_and_then_all_of_it_from_the_firs
     source.push(ramp(3 * SIZE - 1, SIZE))
     np.testing.assert_array_equal(play(source), ramp(0, SIZE))
     assert source.underruns == 0
+
+
+def test_live_samples_of_a_resumed_emitter_fade_in():
+    source = live()
+    source.skip(5 * SIZE)
+    source.push(np.ones(4 * SIZE, np.float32))
+    heard = play(source)
+    assert np.all(np.diff(heard[:FADE_SAMPLES]) > 0)
+    assert heard[0] < 0.01
+    assert np.all(heard[FADE_SAMPLES:] == 1)
 
 
 def test_a_client_that_stops_ends_in_a_fade_and_costs_one_underrun():

@@ -6,7 +6,8 @@ import pytest
 
 from server.acoustics.directivity import CARDIOID, OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
-from server.protocol.client_messages import AddEmitter, MoveEmitter
+from server.protocol.client_messages import AddEmitter, DirectivityPattern, MoveEmitter
+from server.protocol.snapshot import KeptEmitter
 from server.responses.effect_flags import ALL_ON
 from server.responses.emitter_state import EmitterState
 from server.streaming.emitters import Stage, StreamedEmitter
@@ -53,7 +54,8 @@ def test_it_goes_through_all_stages_once_and_is_announced_once():
     assert not emitter.is_decided
     emitter.decide()
     assert emitter.stage is Stage.DECIDED
-    assert [emitter.announce() for _ in range(2)] == [True, False]
+    assert [emitter.announce(clock) for clock in (256, 512)] == [True, False]
+    assert emitter.since == 256
     emitter.decide()
     assert emitter.stage is Stage.ANNOUNCED
 
@@ -75,3 +77,25 @@ def test_a_response_that_is_discarded_is_no_poses(emitter):
     emitter.discard_response()
     assert emitter.is_outdated
     assert emitter.heard.identity is None
+
+
+def test_an_emitter_that_was_heard_in_the_lost_stream_is_not_announced_again():
+    message = AddEmitter(id="a", clip="noise", position=HERE)
+    emitter = StreamedEmitter.added_by(message, 0, None, since=256)
+    assert not emitter.announce(1_024)
+    assert emitter.since == 256
+
+
+def test_what_is_kept_of_an_emitter_adds_it_where_it_is_now():
+    message = AddEmitter(
+        id="a", clip="noise", loop=False, position=HERE, yaw=1.0, directivity=DirectivityPattern(pattern="cardioid")
+    )
+    emitter = StreamedEmitter.added_by(message, 0, None)
+    emitter.move(MoveEmitter(id="a", pose_id=1, position=(3.0, 1.0, 1.2)))
+    emitter.set_gain(-3.0)
+    emitter.announce(512)
+    kept = KeptEmitter.model_validate_json(emitter.kept().model_dump_json())
+    assert kept.since == 512
+    again = StreamedEmitter.added_by(kept.emitter, 1, None, since=kept.since)
+    assert again.state == emitter.state
+    assert (kept.emitter.clip, kept.emitter.loop) == ("noise", False)

@@ -48,3 +48,14 @@ def test_a_block_that_was_not_sent_cannot_have_arrived():
     with pytest.raises(RequestError) as refusal:
         window.acknowledge(0)
     assert refusal.value.code == "unknown_sequence"
+
+
+def test_a_window_may_begin_with_a_later_block():
+    window = SendWindow(3, first=40)
+    assert list(window.take_sequences(5)) == [40, 41, 42]
+    window.acknowledge(12)
+    assert window.is_full
+    window.acknowledge(41)
+    assert (window.unacknowledged, window.sent, window.next_sequence) == (1, 3, 43)
+    with pytest.raises(RequestError):
+        window.acknowledge(43)

@@ -1,3 +1,4 @@
+import json
 import math
 
 import numpy as np
@@ -23,8 +24,10 @@ from server.protocol.client_messages import (
     Ping,
     RemoveEmitter,
     SetGain,
+    StopEmitter,
 )
 from server.protocol.server_messages import EmitterAdded, Error
+from server.protocol.snapshot import Snapshot
 from server.rendering.convolver import Sharing
 from server.responses.full_response import FullResponse
 from server.responses.ir_request import compute_irs
@@ -388,3 +391,117 @@ def test_a_shared_tail_is_the_operators_choice(field, filters):
     for wanted in (False, True):
         session = Session(hello, FieldsByLevel([field]), filters, load_clip, quality=FULL, shared_tail=wanted)
         assert session.renderer._mixers.preparer(2)._sharing is (Sharing.TAIL if wanted else Sharing.NOTHING)
+
+
+def kept(session):
+    """Its state, as it comes back from where it was kept."""
+    return Snapshot.parse(session.snapshot(session="s", handled=7).model_dump_json().encode())
+
+
+def test_a_restored_session_is_in_the_state_of_the_lost_one(session, field, filters):
+    add(session, directivity=DirectivityPattern(pattern="cardioid", order=2.0), yaw=1.0)
+    add(session, "once", loop=False, gain_db=-6.0)
+    session.receive(AddEmitter(id="me", live=True, position=HERE))
+    session.receive(DryBlock("me", 41, np.zeros(100, np.float32)))
+    session.receive(ListenerPose(pose_id=3, position=(3.0, 2.0, 1.2), orientation=(0.1, 0.2, 0.3, 0.9)))
+    session.receive(MoveEmitter(id="talker", pose_id=5, position=(5.0, 3.0, 1.0)))
+    session.receive(SetGain(id="talker", gain_db=-3.0))
+    answer(session, field)
+    hear(session, 5)
+    snapshot = kept(session)
+    assert (snapshot.sample_clock, snapshot.sequence, snapshot.pose_id, snapshot.handled) == (5 * 256, 5, 5, 7)
+    assert [each.since for each in snapshot.emitters] == [0, 0, 0]
+
+    again = Session(snapshot.hello, FieldsByLevel([field]), filters, load_clip, quality=FULL)
+    assert again.restore(snapshot) == []
+    # Numbers that were normalised once more may differ in their last digit.
+    first, second = (json.loads(each.model_dump_json()) for each in (snapshot, kept(again)))
+    assert flat(second) == pytest.approx(flat(first), abs=1e-12)
+    assert codes(again.receive(ListenerPose(pose_id=5, position=HERE))) == ["stale_pose"]
+    assert codes(again.receive(DryBlock("me", 41, np.zeros(9, np.float32)))) == ["stale_block"]
+    assert codes(add(again)) == ["duplicate_emitter"]
+    block = again.render_block()
+    assert (block.sequence, block.sample_clock, block.pose_id, block.reverberation_pose_id) == (5, 5 * 256, 5, 5)
+
+
+def flat(value, path=""):
+    """A JSON document as one dictionary, with the place of each value."""
+    if isinstance(value, dict | list):
+        pairs = value.items() if isinstance(value, dict) else enumerate(value)
+        return {name: each for key, child in pairs for name, each in flat(child, f"{path}/{key}").items()}
+    return {path: value}
+
+
+@pytest.mark.parametrize("loop", [True, False])
+def test_clips_of_a_restored_session_are_where_they_would_be(session, field, filters, loop):
+    add(session, loop=loop)
+    answer(session, field)
+    hear(session, 3)
+    snapshot = kept(session)
+    again = Session(snapshot.hello, FieldsByLevel([field]), filters, load_clip, quality=FULL, window=1_000)
+    again.restore(snapshot)
+    again.continue_at(snapshot.sample_clock + 2 * 256, 20)
+    assert again.sample_clock == 5 * 256
+    lost, silent = hear(session, 2 + 1), hear(again, 1)  # the response comes a block later
+    assert lost.any()
+    assert not silent.any()
+    assert answer(again, field) == []  # the client knows that they are there
+    first, *_, last = (again.render_block() for _ in range(25))
+    assert (first.sequence, first.sample_clock) == (21, 6 * 256)
+    expected = hear(session, 25)
+    assert np.abs(first.samples[:, :16]).max() < 0.01 * np.abs(expected).max()
+    assert_allclose(last.samples, expected[:, -256:], atol=1e-4 * max(np.abs(expected).max(), 0.01))
+
+
+def test_an_emitter_that_cannot_be_restored_is_told_and_the_others_go_on(session, field, filters):
+    add(session, "a")
+    add(session, "b")
+    snapshot = kept(session)
+
+    def forget(name):
+        raise RequestError("unknown_clip", f"there is no clip {name!r}", field="clip", status=404)
+
+    again = Session(snapshot.hello, FieldsByLevel([field]), filters, forget, quality=FULL)
+    errors = again.restore(snapshot)
+    assert codes(errors) == ["unknown_clip"] * 2
+    assert [error.emitter for error in errors] == ["a", "b"]
+    assert again.render_block() is not None
+
+
+def test_a_snapshot_that_this_version_cannot_read_is_an_unknown_one():
+    for data in (b"{}", b"?", b'{"session": "a", "hello": {"type": "hello", "protocol": 3, "scene": "flat"}}'):
+        with pytest.raises(RequestError) as refusal:
+            Snapshot.parse(data)
+        assert refusal.value.code == "unknown_resume_token"
+
+
+@pytest.mark.parametrize("is_told_before", [True, False])
+def test_a_clip_of_a_restored_session_stops_when_it_was_to_and_is_told_once(session, field, filters, is_told_before):
+    """Be its end in the gap or after it."""
+    add(session)
+    answer(session, dead(field))
+    hear(session, 2)
+    session.receive(StopEmitter(id="talker", stop_at=4 * 256, fade_s=0.005))
+    before = [
+        event for _ in range(100 if is_told_before else 1) for event in (hear(session, 1), session.follow_clock())[1]
+    ]
+    assert [event.type for event in before] == ["emitter_ended"] * is_told_before
+    snapshot = kept(session)
+    again = Session(snapshot.hello, FieldsByLevel([field]), filters, load_clip, quality=FULL, window=1_000)
+    again.restore(snapshot)
+    after = []
+    for _ in range(100):
+        answer(again, field)
+        block = again.render_block()
+        assert block.sample_clock <= 12 * 256 or not block.samples.any()
+        after += again.follow_clock()
+    assert [event.type for event in after] == ["emitter_ended"] * (not is_told_before)
+
+
+def test_a_gain_on_its_way_has_arrived_in_a_restored_session(session, field):
+    add(session, gain_db=0.0)
+    answer(session, field)
+    hear(session, 1)
+    session.receive(SetGain(id="talker", gain_db=-12.0, ramp_s=1.0))
+    hear(session, 2)
+    assert kept(session).emitters[0].emitter.gain_db == -12.0

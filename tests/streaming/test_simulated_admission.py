@@ -106,3 +106,26 @@ def test_headroom_falls_as_streams_come_and_rises_as_they_go():
     assert 0.0 < server.admission.headroom < 0.8
     server.run(16.0)
     assert server.admission.headroom == 1.0
+
+
+def test_a_place_that_is_held_counts_as_its_stream_until_it_is_given_back():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    streams = 8
+    for number in range(streams):
+        server.arrive(1, at_s=1.0 + number, emitters=2)
+    server.run(20.0)
+    admission = server.admission
+    lost, other, *_ = admission._places
+    before = admission.load()
+    closing = lost.stream, other.stream
+    assert admission.keep(lost)
+    server.engine.close(closing[0])
+    held = admission.load()
+    assert (admission.streams, admission.held, held.streams) == (streams, 1, streams)
+    assert held.demand == pytest.approx(before.demand, rel=0.5)
+    # One for eight streams.
+    assert not admission.keep(other)
+    server.engine.close(closing[1])
+    assert (admission.streams, admission.held) == (streams - 1, 1)
+    admission.leave(lost)
+    assert (admission.streams, admission.held, admission.load().streams) == (streams - 2, 0, streams - 2)

@@ -1,0 +1,143 @@
+"""Streams whose connections were lost, until their clients come back: a snapshot of each, under a token.
+
+A kept stream is no stream any more. Nothing of it is rendered, and it takes a few kilobytes; only its place on the
+server may be held. So it costs nothing to keep some, and what resumes is a new stream in the state of the old one.
+
+A token is replaced at every resume. The former one is good until the client has sent something: a client whose
+connection broke before the `welcome` arrived knows no other.
+
+`KeptStreams` belongs to the event loop.
+"""
+
+import asyncio
+import secrets
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from server.protocol.snapshot import MOST_BYTES
+from server.streaming.admission import Place
+
+_TOKEN_BYTES = 24
+_MOST_BYTES = 32 * MOST_BYTES
+"""Bytes of all kept snapshots; the oldest make room for the newest."""
+_PATIENCE_S = 2.0
+"""How long the old connection of a stream that is taken over may take to end."""
+
+
+@dataclass(eq=False)
+class KeptStream:
+    """A stream to go on with: its snapshot as JSON, and when the snapshot's next block would play, in seconds of the
+    clock of the audio engine. `place` is held for it, if there was one to hold."""
+
+    data: bytes
+    plays_s: float
+    place: Place | None = None
+    tokens: tuple[str, ...] = field(default=(), init=False)
+    until_s: float = field(default=0.0, init=False)
+    expiry: asyncio.TimerHandle | None = field(default=None, init=False)
+
+
+@dataclass(eq=False)
+class _OpenStream:
+    """A stream that has a connection, which `take_over` ends."""
+
+    tokens: tuple[str, ...]
+    take_over: Callable[[], None]
+    has_ended: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class KeptStreams:
+    """At most `most` streams, each kept for `keep_s` seconds, or none if that is 0. `give_up` is called with the place
+    of a stream that did not come back."""
+
+    def __init__(self, *, keep_s: float, most: int, give_up: Callable[[Place], None]) -> None:
+        self.keep_s = keep_s
+        self.outcomes: Counter[str] = Counter(dict.fromkeys(("kept", "resumed", "expired", "unknown"), 0))
+        """How often a stream was kept, went on, or did not come back, and how often a token was not known."""
+        self._most = most
+        self._give_up = give_up
+        self._open: dict[str, _OpenStream] = {}
+        self._kept: dict[str, KeptStream] = {}
+        self._order: dict[KeptStream, None] = {}
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    @property
+    def has_places(self) -> bool:
+        """Whether a place is held for a stream that may come back."""
+        return any(kept.place is not None for kept in self._order)
+
+    def open(self, take_over: Callable[[], None], *, former: str | None = None) -> str:
+        """Return the token of a stream that begins, or goes on after it was found by a `former` token. `take_over` has
+        to end its connection."""
+        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        stream = _OpenStream((token,) if former is None else (token, former), take_over)
+        self._open.update(dict.fromkeys(stream.tokens, stream))
+        return token
+
+    def confirm(self, token: str) -> None:
+        """Note that the client has the token: the former one is not valid any more."""
+        stream = self._open.get(token)
+        if stream is not None:
+            for former in stream.tokens[1:]:
+                del self._open[former]
+            stream.tokens = stream.tokens[:1]
+
+    def close(self, token: str, kept: KeptStream | None = None) -> None:
+        """Note that the connection of a stream has ended; with `kept` the stream may go on. A second call changes
+        nothing."""
+        stream = self._open.get(token)
+        if stream is None:
+            return
+        for each in stream.tokens:
+            del self._open[each]
+        if kept is not None:
+            kept.tokens, kept.until_s = stream.tokens, asyncio.get_running_loop().time() + self.keep_s
+            self.outcomes["kept"] += 1
+            self.put_back(kept)
+        stream.has_ended.set()
+
+    async def take(self, token: str) -> KeptStream | None:
+        """Return the stream of a token, which is not kept any more then; None if there is none. If the stream has a
+        connection, it is taken over."""
+        stream = self._open.get(token)
+        if stream is not None:
+            stream.take_over()
+            try:
+                async with asyncio.timeout(_PATIENCE_S):
+                    await stream.has_ended.wait()
+            except TimeoutError:
+                pass
+        kept = self._kept.get(token)
+        self.outcomes["unknown" if kept is None else "resumed"] += 1
+        if kept is not None:
+            self._remove(kept)
+        return kept
+
+    def put_back(self, kept: KeptStream) -> None:
+        """Keep a stream that could not go on, as long as it was to be kept."""
+        loop = asyncio.get_running_loop()
+        self._kept.update(dict.fromkeys(kept.tokens, kept))
+        self._order[kept] = None
+        self._bytes += len(kept.data)
+        kept.expiry = loop.call_at(kept.until_s, self._expire, kept)
+        while len(self._order) > self._most or self._bytes > _MOST_BYTES:
+            self._expire(next(iter(self._order)))
+
+    def _expire(self, kept: KeptStream) -> None:
+        self.outcomes["expired"] += 1
+        self._remove(kept)
+        if kept.place is not None:
+            self._give_up(kept.place)
+
+    def _remove(self, kept: KeptStream) -> None:
+        for each in kept.tokens:
+            del self._kept[each]
+        del self._order[kept]
+        self._bytes -= len(kept.data)
+        if kept.expiry is not None:
+            kept.expiry.cancel()
+            kept.expiry = None

@@ -1,0 +1,314 @@
+"""Streams whose connections break. What is heard before and after the gap is compared, sample by sample, with a render
+of the whole clip: where a clip is shows where the clock is."""
+
+import json
+import socket
+import time
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from server.acoustics.decibels import amplitude_to_db
+from server.acoustics.geometry import Pose
+from server.assets.clips import ClipLibrary
+from server.field.field import AcousticField
+from server.offline.render import PathPoint, RenderedEmitter, render
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    Hello,
+    ListenerPose,
+    Ping,
+    RemoveEmitter,
+    Resume,
+    SetGain,
+)
+from server.protocol.server_messages import EmitterAdded, Error, Welcome, parse_server_message
+from server.responses.direct_sound import DirectSound
+from server.scene.effects import EffectName
+from tests.integration.lossy_proxy import LossyProxy
+
+RATE, BLOCK = 24_000, 512
+CLIP = "woman-reading"
+PLACE = (6.0, 3.0, 1.5)
+# Every effect, as the render has it, so that no plan comes between.
+HELLO = Hello(
+    protocol=PROTOCOL, scene="flat", block_size=BLOCK, effects={name.value: True for name in EffectName}, emitters=1
+)
+TALKER = AddEmitter(id="talker", clip=CLIP, position=PLACE)
+SETTLED = 8_000
+"""Samples after which the response is filled with sound, and all fades are over."""
+
+
+class Listener:
+    """A client that acknowledges what it hears, and keeps all of it."""
+
+    def __init__(self, address, first, *, patience_s=5.0):
+        self._open = ExitStack()
+        url = f"ws://{address}/v1/stream"
+        self.socket = self._open.enter_context(connect(url, compression=None, max_size=None, close_timeout=0.1))
+        self.blocks, self.messages = [], []
+        self.send(first)
+        self.first = parse_server_message(self.socket.recv(timeout=patience_s))
+
+    def send(self, message):
+        self.socket.send(message if isinstance(message, str) else message.serialize())
+
+    def receive(self, patience_s=5.0):
+        message = self.socket.recv(timeout=patience_s)
+        if isinstance(message, str):
+            self.messages.append(parse_server_message(message))
+            return self.messages[-1]
+        block = AudioBlock.parse(message, "f32")
+        self.blocks.append(block)
+        with suppress(ConnectionClosed):  # what has arrived before is still to be read
+            self.send(Acknowledge(sequence=block.sequence))
+        return block
+
+    def until(self, kind, condition=lambda _: True, patience_s=5.0):
+        end_s = time.monotonic() + patience_s
+        while time.monotonic() < end_s:
+            message = self.receive()
+            if isinstance(message, kind) and condition(message):
+                return message
+        raise AssertionError(f"no {kind.__name__} came")
+
+    def hear(self, samples):
+        """Until so many more samples of the clock have come."""
+        last = self.until(AudioBlock)
+        return self.until(AudioBlock, lambda block: block.sample_clock >= last.sample_clock + samples, 10.0)
+
+    def resumption(self, **changes):
+        last = self.blocks[-1] if self.blocks else None
+        known = {} if last is None else {"sequence": last.sequence, "sample_clock": last.sample_clock}
+        return Resume(**{"protocol": PROTOCOL, "token": self.first.resume_token, **known, **changes})
+
+    def to_the_end(self):
+        """Hear until the connection ends, and return why."""
+        try:
+            while True:
+                self.receive()
+        except ConnectionClosed as closed:
+            return closed.rcvd
+
+    def drop(self):
+        """Lose the connection without a goodbye."""
+        self.socket.socket.shutdown(socket.SHUT_RDWR)
+        assert self.to_the_end() is None
+
+    def close(self):
+        self._open.close()
+
+
+@contextmanager
+def listening(address, first=HELLO, **options):
+    listener = Listener(address, first, **options)
+    try:
+        yield listener
+    finally:
+        listener.close()
+
+
+@pytest.fixture(scope="module")
+def expected(bundle, filters):
+    """(2, n): the clip, twice, as the room has it."""
+    clip = np.tile(ClipLibrary(RATE).load(CLIP).samples, 2)
+    start = bundle.manifest.start
+    path = [PathPoint.at(0, Pose.from_yaw(start.listener, np.radians(start.listener_yaw_deg)))]
+    emitter = RenderedEmitter(clip, Pose(PLACE))
+    return render(AcousticField.load(bundle), DirectSound.of(bundle, filters), [emitter], path)
+
+
+def error_db(blocks, expected, since):
+    """How far blocks are from what the clip sounds like at their place on the clock."""
+    heard = np.concatenate([block.samples for block in blocks], axis=1)
+    places = np.concatenate([block.sample_clock - since + np.arange(BLOCK) for block in blocks])
+    wanted = expected[:, places]
+    return amplitude_to_db(np.sqrt(np.mean((heard - wanted) ** 2) / np.mean(wanted**2)))
+
+
+def begin(listener):
+    listener.send(TALKER)
+    added = listener.until(EmitterAdded)
+    listener.hear(SETTLED)
+    return added.sample_clock
+
+
+def after(blocks, samples):
+    return [block for block in blocks if block.sample_clock >= blocks[0].sample_clock + samples]
+
+
+@pytest.mark.parametrize("gap_s", [0.5, pytest.param(10.0, marks=pytest.mark.long)])
+def test_a_gap_costs_a_fade_and_nothing_else(served, expected, gap_s):
+    with LossyProxy(served).running() as network, listening(network.address) as before:
+        assert before.first.resumed is None
+        since = begin(before)
+        lost = before.hear(RATE // 4)
+        cut_s = time.monotonic()
+        network.cut()
+        time.sleep(gap_s)
+        with listening(network.address, before.resumption()) as again:
+            resumed = again.first.resumed
+            passed_s = time.monotonic() - cut_s
+            # Sent up to eight blocks ahead of real time, both before and after.
+            gap = resumed.sample_clock - lost.sample_clock
+            assert gap == pytest.approx(passed_s * RATE, abs=20 * BLOCK)
+            again.hear(SETTLED + RATE // 2)
+            first = again.blocks[0]
+            assert (first.sequence, first.sample_clock) == (resumed.sequence, resumed.sample_clock)
+            assert resumed.sequence == before.blocks[-1].sequence + 1
+            assert resumed.sample_clock % BLOCK == 0
+    assert again.first.session == before.first.session
+    assert again.first.resume_token != before.first.resume_token
+    assert not any(isinstance(message, EmitterAdded) for message in again.messages)
+    assert error_db(after(before.blocks, since - before.blocks[0].sample_clock + SETTLED), expected, since) < -80
+    assert error_db(after(again.blocks, SETTLED), expected, since) < -80
+    # And what it costs is a fade: nothing jumps in.
+    sound = np.concatenate([block.samples for block in again.blocks], axis=1)
+    onset = int(np.flatnonzero(np.abs(sound).max(axis=0) > 0)[0])
+    assert np.abs(np.diff(sound[:, onset - 1 : onset + 64])).max() < 0.1 * np.abs(sound).max()
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(4, marks=pytest.mark.long)])
+def test_a_slow_and_lossy_network_breaks_again_and_again(served, expected, count):
+    """200 ms of delay and 15 % of loss. The clock only rises, and blocks are numbered without a gap."""
+    blocks = []
+    with LossyProxy(served, delay_s=0.2, loss=0.15).running() as network:
+        listener = Listener(network.address, HELLO.model_copy(update={"buffer_blocks": 32}))
+        since = begin(listener)
+        for _ in range(count):
+            listener.hear(RATE // 4)
+            blocks += listener.blocks
+            network.cut()
+            listener.close()
+            listener = Listener(network.address, listener.resumption())
+            assert listener.first.resumed is not None
+        # The first 32 blocks are rendered before the first response is there.
+        settled = SETTLED + 32 * BLOCK
+        listener.hear(settled + RATE // 4)
+        listener.close()
+    assert error_db(after(listener.blocks, settled), expected, since) < -80
+    blocks += listener.blocks
+    assert [block.sequence for block in blocks] == list(range(len(blocks)))
+    assert all(a.sample_clock < b.sample_clock for a, b in pairwise(blocks))
+
+
+def test_a_half_open_connection_is_taken_over(served, expected):
+    """The server still believes in it, and would until it is stalled."""
+    with LossyProxy(served).running() as network, listening(network.address) as old:
+        since = begin(old)
+        network.go_dark()
+        with listening(network.address, old.resumption()) as new:
+            assert new.first.resumed.sample_clock > old.blocks[-1].sample_clock
+            new.hear(SETTLED + RATE // 4)
+    assert error_db(after(new.blocks, SETTLED), expected, since) < -80
+
+
+def test_who_is_taken_over_is_told(served):
+    with listening(served) as old:
+        old.hear(BLOCK)
+        with listening(served, old.resumption()) as new:
+            ending = old.to_the_end()
+            assert (ending.code, ending.reason) == (4409, "taken_over")
+            assert old.messages[-1].code == "taken_over"
+            assert new.first.resumed is not None
+
+
+def test_nothing_that_was_handled_is_lost_and_the_rest_is_told(served):
+    """The client learns how many of its messages came, and up to which pose."""
+    changes = [
+        TALKER,
+        SetGain(id="talker", gain_db=-6.0),
+        '{"type": "set_gain", "id": "nobody", "gain_db": 1}',
+        "no message at all",
+        AddEmitter(id="second", clip=CLIP, position=(2.0, 3.0, 1.5)),
+        RemoveEmitter(id="second"),
+    ]
+    with listening(served) as listener:
+        for number, change in enumerate(changes, 1):
+            listener.send(change)
+            listener.send(ListenerPose(pose_id=number, position=(2.0 + 0.1 * number, 2.5, 1.5)))
+            listener.send(Ping(id=number))
+            listener.send('{"type": "ping", "id": -1}')
+        listener.until(AudioBlock, lambda block: block.pose_id == len(changes))
+        listener.drop()
+    with listening(served, listener.resumption()) as again:
+        resumed = again.first.resumed
+        assert (resumed.handled, resumed.pose_id) == (len(changes), len(changes))
+        again.send(AddEmitter(id="talker", clip=CLIP, position=PLACE))
+        assert again.until(Error).code == "duplicate_emitter"
+        again.send(AddEmitter(id="second", clip=CLIP, position=PLACE))
+        again.until(EmitterAdded)
+        again.drop()
+        with listening(served, again.resumption()) as third:
+            assert third.first.resumed.handled == len(changes) + 2
+
+
+@pytest.mark.untimed
+def test_a_token_is_good_for_one_stream_that_did_not_say_goodbye(served):
+    with listening(served, Resume(protocol=PROTOCOL, token="never-given")) as stranger:
+        assert (stranger.first.code, stranger.first.field) == ("unknown_resume_token", "token")
+    with listening(served) as listener:
+        assert isinstance(listener.first, Welcome)
+        listener.until(AudioBlock)
+    # It has said goodbye.
+    with listening(served, listener.resumption()) as again:
+        assert again.first.code == "unknown_resume_token"
+    with listening(served, listener.resumption(protocol=2)) as old:
+        assert old.first.code == "unsupported_protocol"
+    with listening(served) as listener:
+        listener.until(AudioBlock)
+        listener.send(listener.resumption())
+        assert listener.until(Error).code == "unexpected_resume"
+        listener.until(AudioBlock)
+
+
+@pytest.mark.untimed
+def test_on_a_full_server_a_place_is_held_for_who_comes_back(monkeypatch, request):
+    """One place for eight streams; of others the state is kept all the same."""
+    monkeypatch.setenv("NAFIR_MAX_STREAMS", "8")
+    monkeypatch.setenv("NAFIR_ADMISSION", "false")
+    address = request.getfixturevalue("served_anew")
+    with ExitStack() as stack:
+        listeners = [stack.enter_context(listening(address)) for _ in range(8)]
+        for listener in listeners[:2]:
+            listener.until(AudioBlock)
+            listener.drop()
+            time.sleep(0.2)
+        newcomer = stack.enter_context(listening(address))
+        assert isinstance(newcomer.first, Welcome)
+        refused = stack.enter_context(listening(address))
+        assert refused.first.code == "server_busy"
+        back = stack.enter_context(listening(address, listeners[0].resumption()))
+        assert back.first.resumed is not None
+
+        def the_other():
+            """Its welcome, once there is room for it."""
+            with suppress(InvalidStatus), ExitStack() as attempt:
+                late = attempt.enter_context(listening(address, listeners[1].resumption()))
+                return late.first if isinstance(late.first, Welcome) else None
+
+        assert the_other() is None
+        newcomer.close()
+        for _ in range(50):  # until the server has noticed
+            if (welcome := the_other()) is not None:
+                assert welcome.resumed is not None
+                return
+            time.sleep(0.05)
+        raise AssertionError("there was no place for the other one")
+
+
+@pytest.mark.untimed
+def test_a_server_told_to_keep_nothing_gives_no_token(monkeypatch, request):
+    monkeypatch.setenv("NAFIR_RESUME_S", "0")
+    address = request.getfixturevalue("served_anew")
+    with connect(f"ws://{address}/v1/stream") as socket:
+        socket.send(HELLO.serialize())
+        welcome = json.loads(socket.recv(timeout=5))
+    assert not {"resume_token", "resume_s", "resumed"} & welcome.keys()
