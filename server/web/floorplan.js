@@ -171,6 +171,11 @@ export class FloorPlan extends EventTarget {
     mark.setAttribute("aria-label", `Source ${id} at ${position[0].toFixed(1)}, ${position[1].toFixed(1)} metres; arrow keys move it`);
   }
 
+  /** The place [x, y] at a mouse event. */
+  at(event) {
+    return this.#pointer(event);
+  }
+
   #pointer({ clientX, clientY }) {
     const box = this.#svg.getBoundingClientRect();
     return this.#view.toWorld([clientX - box.left, clientY - box.top]);

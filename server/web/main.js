@@ -13,6 +13,7 @@ import { Legend } from "./legend.js";
 import { LoudnessField, combine, parseGrid, raised, scaleOf } from "./loudness.js";
 import { Notices } from "./notices.js";
 import { exposeHook } from "./hook.js";
+import { OwnSounds, isOwn } from "./own_sounds.js";
 import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
@@ -55,6 +56,7 @@ class Page {
     this.level = this.head = null; // the present level and head; null while there is no stream
     this.decoded = null; // the head whose filters the worklet has
     this.player = new Player();
+    this.own = new OwnSounds();
     this.ledger = new PoseLedger();
     this.reverberationLedger = new PoseLedger();
     this.turnLedger = new TurnLedger();
@@ -62,6 +64,7 @@ class Page {
     this.stream = new WorkerStream();
     this.connection = "idle";
     this.playing = false;
+    this.isFed = false; // whether the visitor's own sounds go into the stream
     this.steady = false;
     this.grids = new Map(); // emitter id -> {key, grid}
     this.mapping = null; // AbortController of the request for the next map
@@ -167,6 +170,7 @@ class Page {
     this.#listenToWorld();
     this.#listenToSound();
     this.#listenToControls();
+    this.#listenToOwnSounds();
     this.map();
     find("play").disabled = false;
     document.body.classList.add("ready");
@@ -181,12 +185,12 @@ class Page {
       this.#pointNeedle();
     });
     world.addEventListener("emitter", ({ detail }) => {
-      this.#tell("emitter", this.#emitterNow(detail));
+      this.#say(detail);
       if (this.grids.get(detail.id)?.key !== placeKey(detail)) this.paper.stale = true;
     });
     world.addEventListener("emitters", () => {
-      for (const id of known.keys()) if (!world.emitters.has(id)) this.#tell("remove", { id });
-      for (const [id, emitter] of world.emitters) if (!known.has(id)) this.#tell("emitter", this.#emitterNow(emitter));
+      for (const id of known.keys()) if (!world.emitters.has(id)) this.#remove(id);
+      for (const [id, emitter] of world.emitters) if (!known.has(id)) this.#say(emitter);
       known = new Map(world.emitters);
       this.map();
     });
@@ -279,6 +283,66 @@ class Page {
     });
   }
 
+  #listenToOwnSounds() {
+    const { own, plan, sources } = this;
+    for (const id of ["add-microphone", "add-file"]) find(id).disabled = false;
+    find("add-microphone").addEventListener("click", () => own.addMicrophone());
+    find("add-file").addEventListener("click", () => find("file").click());
+    find("file").addEventListener("change", ({ target }) => {
+      for (const file of target.files) own.addFile(file);
+      target.value = ""; // so that the same file can be chosen again
+    });
+    own.addEventListener("refused", ({ detail }) => this.notices.show("own", detail));
+    own.addEventListener("added", ({ detail: { name, place } }) => {
+      sources.own = own.all;
+      if (this.world.isFull) {
+        this.notices.show("own", "No more sources fit: choose the sound at one of those that there are.");
+        return;
+      }
+      const { id } = this.world.addEmitter({ clip: name });
+      if (place) this.world.moveEmitter(id, place);
+    });
+    const area = find("plan");
+    const bringsFiles = (event) => event.dataTransfer?.types.includes("Files");
+    window.addEventListener("dragover", (event) => {
+      if (!bringsFiles(event)) return;
+      event.preventDefault(); // or the browser opens the file in place of the page
+      area.classList.toggle("receives", area.contains(event.target));
+    });
+    window.addEventListener("dragleave", (event) => event.relatedTarget === null && area.classList.remove("receives"));
+    window.addEventListener("drop", (event) => {
+      if (!bringsFiles(event)) return;
+      event.preventDefault();
+      area.classList.remove("receives");
+      const place = area.contains(event.target) ? plan.at(event) : null;
+      for (const file of event.dataTransfer.files) own.addFile(file, place);
+    });
+  }
+
+  /** Tells the stream how an emitter is now. */
+  #say(emitter) {
+    this.#tell("emitter", this.#emitterNow(emitter));
+    this.#feed(emitter);
+  }
+
+  #remove(id) {
+    this.own.stop(id);
+    this.#tell("remove", { id });
+  }
+
+  /** Plays an emitter's own sound into the stream, if it has one and the stream is there. */
+  #feed({ id, clip }) {
+    const wanted = isOwn(clip) && this.isFed ? clip : undefined;
+    if (this.own.played(id) === wanted) return;
+    if (wanted === undefined) {
+      this.own.stop(id);
+      return;
+    }
+    const tap = this.player.tap();
+    this.#tell("tap", { id, port: tap.port }, [tap.port]);
+    this.own.play(id, clip, this.player.context, tap);
+  }
+
   #setVolume(percent) {
     find("volume").style.setProperty("--value", `${percent}%`);
     this.player.volume = (percent / 100) ** 2; // closer to perceived loudness than a linear control
@@ -329,7 +393,7 @@ class Page {
     const link = linkTo(location.href, {
       scene: this.scene.id,
       listener: this.world.listener,
-      sources: [...this.world.emitters.values()],
+      sources: [...this.world.emitters.values()].filter(({ clip }) => !isOwn(clip)),
       level: level === "auto" ? undefined : level,
       output: output === "headphones" ? undefined : output,
       head: this.heads.chosen,
@@ -351,7 +415,8 @@ class Page {
   }
 
   #emitterNow({ id, clip, position, gainDb }) {
-    return { id, clip, position: [...position], gainDb, at: epochNow() };
+    const sound = isOwn(clip) ? { live: true } : { clip };
+    return { id, ...sound, position: [...position], gainDb, at: epochNow() };
   }
 
   #tell(type, detail, transfer = []) {
@@ -428,6 +493,8 @@ class Page {
       ...this.#outputNow(),
     };
     if (this.output === "ambisonics") this.#listenWithHead();
+    this.isFed = true;
+    for (const emitter of this.world.emitters.values()) this.#feed(emitter);
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
     this.#tell("open", { url: streamUrl(), key: key(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
@@ -435,12 +502,19 @@ class Page {
   async pause() {
     if (!this.playing) return;
     this.#setPlaying(false);
+    this.#starve();
     await this.player.pause();
     if (this.playing) return;
     this.#tell("close");
     this.output = null;
     this.#blank();
     this.#setConnection("idle", "Paused");
+  }
+
+  /** Ends what plays the visitor's own sounds, and gives the microphone back. */
+  #starve() {
+    this.isFed = false;
+    this.own.stopAll();
   }
 
   /** Clears the figures of a stream that has ended. */
@@ -495,6 +569,7 @@ class Page {
     } else if (state === "refused") {
       if (!needsKey) this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);
+      this.#starve();
       const paused = this.player.pause();
       this.output = null;
       this.#blank();

@@ -57,6 +57,16 @@ export class Player extends EventTarget {
     this.#output?.turn(orientation, at);
   }
 
+  /** The AudioContext; null before the first start. */
+  get context() {
+    return this.#context;
+  }
+
+  /** What takes the sound of a live emitter; see Output. */
+  tap() {
+    return this.#output.tap();
+  }
+
   #fade(target) {
     this.#gain.gain.setTargetAtTime(target, this.#context.currentTime, 0.015);
   }

@@ -20,6 +20,7 @@ const disable = (button, isDisabled) => button.setAttribute("aria-disabled", isD
 export class Sources {
   #world;
   #clips;
+  #own = []; // {name, title} of the visitor's own sounds
   #list;
   #add;
   #limit;
@@ -49,6 +50,19 @@ export class Sources {
   set clips(clips) {
     this.#clips = clips;
     this.#sync();
+  }
+
+  /** Takes the sounds of the visitor, which every source may play as well. */
+  set own(sounds) {
+    this.#own = sounds;
+    for (const { select } of this.#rows.values()) this.#offer(select);
+    this.#describe();
+  }
+
+  #offer(select) {
+    const { value } = select;
+    select.replaceChildren(...[...this.#clips, ...this.#own].map(({ name, title }) => new Option(title || name, name)));
+    select.value = value;
   }
 
   /** The first clip that no emitter plays yet. */
@@ -81,7 +95,7 @@ export class Sources {
     badge.textContent = emitter.id;
     const select = document.createElement("select");
     select.setAttribute("aria-label", `What source ${emitter.id} plays`);
-    for (const { name, title } of this.#clips) select.add(new Option(title || name, name));
+    this.#offer(select);
     select.value = emitter.clip;
     let byPointer = false;
     select.addEventListener("pointerdown", () => (byPointer = true));

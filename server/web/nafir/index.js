@@ -15,6 +15,7 @@ import { orientationOf } from "./wire.js";
 import { WorkerStream } from "./worker_stream.js";
 
 export { RequestError } from "./http.js";
+export { microphone } from "./microphone.js";
 export { Output } from "./output.js";
 export { WorkerStream } from "./worker_stream.js";
 
@@ -218,22 +219,19 @@ class Nafir extends EventTarget {
   addEmitter({ id = `emitter-${++this.#count}`, clip, source, loop, directivity, ...rest }) {
     if (this.#emitters.has(id)) throw new Error(`there is an emitter ${id} already`);
     const sound = clip === undefined ? { live: true } : { clip, loop };
-    const input = clip === undefined ? this.#tap(id) : null;
+    const tap = clip === undefined ? this.#tap(id) : null;
+    const input = tap?.node ?? null;
     const emitter = new Emitter(this, { id, input, ...rest }, () => this.#emitterMoved(id));
-    this.#emitters.set(id, { emitter, sound: { ...sound, directivity } });
+    this.#emitters.set(id, { emitter, tap, sound: { ...sound, directivity } });
     source?.connect(input);
     this.#emitterMoved(id);
     return emitter;
   }
 
   #tap(id) {
-    const node = new AudioWorkletNode(this.#context, "nafir-tap", { numberOfOutputs: 1 });
-    // A node is only asked to process where it leads somewhere. Its output is silent.
-    node.connect(this.#context.destination);
-    const { port1, port2 } = new MessageChannel();
-    node.port.postMessage({ port: port1 }, [port1]);
-    this.#stream.tell("tap", { id, port: port2 }, [port2]);
-    return node;
+    const tap = this.#sound.tap();
+    this.#stream.tell("tap", { id, port: tap.port }, [tap.port]);
+    return tap;
   }
 
   #emitterMoved(id) {
@@ -247,13 +245,8 @@ class Nafir extends EventTarget {
     const known = this.#emitters.get(id);
     if (!known) return;
     this.#emitters.delete(id);
-    this.#untap(known.emitter);
+    known.tap?.end();
     this.#stream.tell("remove", { id });
-  }
-
-  #untap({ input }) {
-    input?.port.postMessage({ port: null });
-    input?.disconnect();
   }
 
   /** All emitters, by id. */
@@ -286,7 +279,7 @@ class Nafir extends EventTarget {
   close() {
     if (this.state === "closed") return;
     this.state = "closed";
-    for (const { emitter } of this.#emitters.values()) this.#untap(emitter);
+    for (const { tap } of this.#emitters.values()) tap?.end();
     this.#emitters.clear();
     this.#stream.end();
     this.#sound.end();
@@ -315,11 +308,4 @@ export async function connect(context, url, options) {
   const worker = assets === undefined ? undefined : new Worker(at("stream_worker.js"), { type: "module" });
   const nafir = new Nafir(context, api, { ...options, listener: start }, sound, new WorkerStream(worker));
   return nafir.open(signal);
-}
-
-/** An AudioNode with the sound of a microphone, without the processing that telephones need. Asks the user. */
-export async function microphone(context, constraints = {}) {
-  const raw = { echoCancellation: false, noiseSuppression: false, autoGainControl: false };
-  const stream = await navigator.mediaDevices.getUserMedia({ audio: { ...raw, ...constraints } });
-  return context.createMediaStreamSource(stream);
 }

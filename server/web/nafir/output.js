@@ -32,6 +32,21 @@ export class Output extends EventTarget {
     return port2;
   }
 
+  /** What takes the sound of a live emitter: {node, port, end()}. `node` is the AudioNode to connect to, and its sound comes out of `port`,
+      which is for the command "tap" of the stream. */
+  tap() {
+    const node = new AudioWorkletNode(this.#context, "nafir-tap", { numberOfOutputs: 1 });
+    // A node is only asked to process where it leads somewhere. Its output is silent.
+    node.connect(this.#context.destination);
+    const { port1, port2 } = new MessageChannel();
+    node.port.postMessage({ port: port1 }, [port1]);
+    const end = () => {
+      node.port.postMessage({ port: null });
+      node.disconnect();
+    };
+    return { node, port: port2, end };
+  }
+
   /** Ends the node: it plays nothing any more, and nothing keeps it. */
   end() {
     this.node.port.postMessage({ type: "end" });
