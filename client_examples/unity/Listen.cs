@@ -1,6 +1,6 @@
 // Hears a scene without Unity: walks past a clip, or past a live source, and prints the level of both ears ten times a second.
 //
-//   mono Listen.exe [HOST:PORT [SCENE [CLIP|live [SECONDS]]]]
+//   mono Listen.exe [HOST:PORT [SCENE [CLIP|live [SECONDS [KEY]]]]]
 
 using System;
 using System.Globalization;
@@ -20,7 +20,7 @@ static class Listen
         var east = new NafirQuaternion(0, 0.70710678f, 0, 0.70710678f);
         Func<double, NafirPose> walk = share => NafirPose.FromUnity(new NafirVector((float)(2 + 2 * share), 1.5f, 2.5f), east);
         var source = new NafirSource { Clip = clip == "live" ? null : clip, Pose = NafirPose.FromUnity(new NafirVector(6, 1.5f, 3), east) };
-        using (var stream = new NafirStream($"ws://{address}/v1/stream", scene, OutputRate, walk(0)))
+        using (var stream = new NafirStream($"ws://{address}/v1/stream", scene, OutputRate, walk(0), key: Word(words, 4, null)))
         {
             stream.SetEmitter("source", source);
             var ears = new float[2 * Frames];

@@ -1,7 +1,7 @@
 // Hears a scene without Unreal: a WebSocket of POSIX sockets around the headers in Nafir/. It walks two metres past a clip and prints the
 // level of both ears ten times a second.
 //
-//   g++ -std=c++17 client_examples/unreal/listen.cpp -o listen && ./listen 127.0.0.1 8000 apartment
+//   g++ -std=c++17 client_examples/unreal/listen.cpp -o listen && ./listen 127.0.0.1 8000 apartment [CLIP [SECONDS [KEY]]]
 
 #include <netdb.h>
 #include <sys/socket.h>
@@ -29,7 +29,7 @@ class WebSocket {
  public:
   enum Kind { kText = 1, kBinary = 2, kClose = 8, kPing = 9, kPong = 10 };
 
-  WebSocket(const std::string& host, const std::string& port, const std::string& path) {
+  WebSocket(const std::string& host, const std::string& port, const std::string& path, const std::string& key) {
     addrinfo hints{}, *found = nullptr;
     hints.ai_socktype = SOCK_STREAM;
     if (getaddrinfo(host.c_str(), port.c_str(), &hints, &found) != 0) Fail("no such host: " + host);
@@ -37,7 +37,7 @@ class WebSocket {
     if (connect(socket_, found->ai_addr, found->ai_addrlen) != 0) Fail("nobody listens at " + host + ":" + port);
     freeaddrinfo(found);
     Write("GET " + path + " HTTP/1.1\r\nHost: " + host + ":" + port +
-          "\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: bmFmaXIgbmFmaXIgbmFmaQ==\r\n\r\n");
+          "\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: bmFmaXIgbmFmaXIgbmFmaQ==\r\n" + (key.empty() ? "" : "Authorization: Bearer " + key + "\r\n") + "\r\n");
     std::string answer;
     while (answer.size() < 4 || answer.compare(answer.size() - 4, 4, "\r\n\r\n") != 0) answer += static_cast<char>(ReadByte());
     if (answer.compare(0, 12, "HTTP/1.1 101") != 0) Fail("refused: " + answer);
@@ -123,7 +123,7 @@ int main(int count, char** words) {
   const nafir::Quaternion ahead{0, 0, 0, 1};
   const auto encoding = nafir::Encoding::kInt16;
 
-  WebSocket socket(host, port, "/v1/stream");
+  WebSocket socket(host, port, "/v1/stream", count > 6 ? words[6] : "");
   socket.Send(nafir::message::Hello(scene, 0, 256, encoding, 8, nafir::FromUnreal(location, ahead)));
   double rate = 0, heard_s = 0, reported_s = 0, energy[2] = {0, 0};
   std::size_t frames = 0;

@@ -13,7 +13,7 @@ from server.protocol.client_messages import parse_client_message
 from tests.clients.vectors import CLIENTS, TABLE, assert_same_poses, poses, readme_commands
 
 COMPILER, MONO = shutil.which("mcs"), shutil.which("mono")
-pytestmark = pytest.mark.skipif(
+pytestmark = needs_mono = pytest.mark.skipif(
     COMPILER is None or MONO is None, reason="no mono on the PATH (Debian: apt-get install mono-mcs mono-runtime)"
 )
 

@@ -12,7 +12,9 @@ from server.protocol.client_messages import Hello, MoveEmitter, parse_client_mes
 from tests.clients.vectors import CLIENTS, TABLE, assert_same_poses, poses, readme_commands
 
 COMPILER = shutil.which("g++")
-pytestmark = pytest.mark.skipif(COMPILER is None, reason="no g++ on the PATH (Debian: apt-get install g++)")
+pytestmark = needs_compiler = pytest.mark.skipif(
+    COMPILER is None, reason="no g++ on the PATH (Debian: apt-get install g++)"
+)
 
 # As Unreal compiles: no exceptions, no run-time types.
 OPTIONS = [

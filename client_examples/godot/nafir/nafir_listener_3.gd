@@ -5,6 +5,7 @@ const Core = preload("nafir_core.gd")
 
 export var url = "ws://127.0.0.1:8000/v1/stream"
 export var scene = "apartment"
+export var key = "" # an API key or token, if the server asks for one
 export var buffer_s = 0.08
 export(NodePath) var origin # the node at the scene's origin; empty if that is the world's
 
@@ -48,7 +49,8 @@ func _open():
 	_socket.connect("connection_error", self, "_ended")
 	_socket.connect("connection_closed", self, "_ended")
 	_socket.connect("data_received", self, "_received")
-	_has_ended = _socket.connect_to_url(url) != OK
+	var headers = [] if key == "" else ["Authorization: Bearer %s" % key]
+	_has_ended = _socket.connect_to_url(url, [], false, headers) != OK
 
 
 func _opened(_protocol):

@@ -5,6 +5,7 @@ const Core = preload("nafir_core.gd")
 
 @export var url := "ws://127.0.0.1:8000/v1/stream"
 @export var scene := "apartment"
+@export var key := "" ## an API key or token, if the server asks for one
 @export var buffer_s := 0.08
 @export var origin: Node3D ## the node at the scene's origin; empty if that is the world's
 
@@ -47,6 +48,8 @@ func _open() -> void:
 	_socket.inbound_buffer_size = 1 << 20
 	_socket.outbound_buffer_size = 1 << 18
 	_socket.max_queued_packets = 1024
+	if key != "":
+		_socket.handshake_headers = PackedStringArray(["Authorization: Bearer %s" % key])
 	if _socket.connect_to_url(url) != OK:
 		_lost("no connection to %s" % url)
 

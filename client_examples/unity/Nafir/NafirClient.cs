@@ -13,6 +13,9 @@ namespace Nafir
         [Tooltip("One of GET /v1/scenes.")]
         public string scene = "apartment";
 
+        [Tooltip("An API key or token, if the server asks for one.")]
+        public string key = "";
+
         [Tooltip("Where the scene's origin is in the game; empty if at the world's.")]
         public Transform origin;
 
@@ -28,7 +31,7 @@ namespace Nafir
         void OnEnable()
         {
             told = NafirState.Connecting;
-            stream = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer);
+            stream = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer, key);
         }
 
         void OnDisable()

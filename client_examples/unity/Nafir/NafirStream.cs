@@ -22,7 +22,7 @@ namespace Nafir
         static readonly int[] RetryMs = { 250, 500, 1000, 2000, 4000 };
 
         readonly Uri url;
-        readonly string scene;
+        readonly string scene, key;
         readonly int blockSize, bufferBlocks, outputRate;
         readonly double targetS;
         readonly CancellationTokenSource ending = new CancellationTokenSource();
@@ -49,11 +49,13 @@ namespace Nafir
             public ulong SentFrames;
         }
 
-        /// <summary>`outputRate` is the sound card's. `targetS` is how much sound is held back against a network that stalls.</summary>
-        public NafirStream(string url, string scene, int outputRate, NafirPose listener, double targetS = 0.06, int blockSize = 256, int bufferBlocks = 8)
+        /// <summary>`outputRate` is the sound card's. `targetS` is how much sound is held back against a network that stalls. `key` is an API
+        /// key or token, if the server asks for one.</summary>
+        public NafirStream(string url, string scene, int outputRate, NafirPose listener, double targetS = 0.06, string key = null, int blockSize = 256, int bufferBlocks = 8)
         {
             this.url = new Uri(url);
             this.scene = scene;
+            this.key = key;
             this.outputRate = outputRate;
             this.listener = listener;
             this.targetS = targetS;
@@ -219,6 +221,7 @@ namespace Nafir
             using (var leaving = CancellationTokenSource.CreateLinkedTokenSource(ending.Token))
             {
                 leaving.CancelAfter(ConnectMs);
+                if (!string.IsNullOrEmpty(key)) socket.Options.SetRequestHeader("Authorization", $"Bearer {key}");
                 await socket.ConnectAsync(url, leaving.Token).ConfigureAwait(false);
                 NafirPose start;
                 lock (gate) start = listener;
