@@ -29,7 +29,7 @@ def listen(
         ),
     ] = None,
     silent: Annotated[bool, typer.Option("--silent", help="Only write the file, without a sound card.")] = False,
-    device: Annotated[str | None, typer.Option(help="Sound card: a name or number of sounddevice's.")] = None,
+    device: Annotated[str, typer.Option(help="Sound card: a name or number of sounddevice's.")] = "",
 ) -> None:
     """Play or record a walk through a scene of a running server, with a meter in the terminal.
 

@@ -215,6 +215,18 @@ def test_a_stream_is_resumed_with_what_the_server_has_not_got():
     assert (block.sample_clock, session.statistics.blocks_skipped) == (768, 0)
 
 
+def test_an_emitter_that_the_server_has_is_heard_even_if_that_was_said_to_nobody():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    there = session.add_emitter({"id": "there", "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
+    lost = session.add_emitter({"id": "lost", "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
+    drained(session.outbox)
+    session.first_message()
+    session.greet(resumable(sample_clock=768, sequence=0, pose_id=0, handled=1), 0.0)
+    assert (there.is_heard, there.start_clock, lost.is_heard) == (True, 768, False)
+
+
 def test_messages_that_are_lost_twice_are_sent_twice():
     session = Session("flat", {})
     session.first_message()

@@ -44,11 +44,12 @@ def test_a_clip_is_heard_from_its_start_and_no_block_is_missing(served):
         async with connect(served) as stream:
             assert (stream.scene.id, stream.sample_rate, stream.block_size, stream.channels) == ("flat", 24_000, 256, 2)
             clip = await stream.add_emitter(clip="woman-reading")
-            return clip.start_clock, await blocks_of(stream, 150)
+            return clip.start_clock, await blocks_of(stream, 150), stream.statistics
 
-    start, blocks = running(listen())
-    clocks = [block.sample_clock for block in blocks]
-    assert clocks == [256 * (block.sequence) for block in blocks]
+    start, blocks, counts = running(listen())
+    assert [block.sequence for block in blocks] == list(range(150))
+    # On a busy machine the server may have left some out.
+    assert blocks[-1].sample_clock <= 256 * (149 + counts.blocks_skipped)
     before = [block for block in blocks if block.sample_clock < start]
     assert all(not block.samples.any() for block in before)
     assert loudness(blocks[len(before) :]) > 1e-3
@@ -221,7 +222,7 @@ def test_round_trips_and_late_blocks_are_counted(served):
     counts = running(listen())
     assert counts["blocks"] >= 50
     assert counts["round_trip_ms"] > 0
-    assert counts["blocks_skipped"] == counts["reconnections"] == 0
+    assert counts["reconnections"] == 0
 
 
 def test_blocks_that_are_not_taken_are_dropped_and_the_stream_stays_open(served, monkeypatch):
@@ -236,7 +237,6 @@ def test_blocks_that_are_not_taken_are_dropped_and_the_stream_stays_open(served,
     block, newest, counts = running(listen())
     assert newest - block.sample_clock <= 0.2 * 24_000 + 256
     assert counts.blocks_dropped == block.sequence
-    assert counts.blocks_skipped == 0  # all were acknowledged
 
 
 def test_a_scene_there_is_not_is_refused_by_the_hello(served):
@@ -279,6 +279,7 @@ class Proxy:
         self.is_open = True
         self.connections = 0
         self._writers = []
+        self._silenced = set()
 
     async def serve(self, reader, writer):
         self.connections += 1
@@ -292,8 +293,13 @@ class Proxy:
 
     async def _relay(self, reader, writer):
         while data := await reader.read(65_536):
-            writer.write(data)
+            if writer not in self._silenced:
+                writer.write(data)
         writer.close()
+
+    def silence(self):
+        """Let nothing through any more on the present connections, which stay open."""
+        self._silenced |= set(self._writers)
 
     def cut(self):
         """End every connection as a network does: without a goodbye."""
@@ -341,8 +347,22 @@ def test_a_lost_connection_is_made_anew_with_the_emitters_the_level_and_the_pose
     gaps = np.diff(clocks)
     assert (gaps % 256 == 0).all()
     assert (gaps > 0).all()
-    assert np.count_nonzero(gaps > 256) <= 1
     assert loudness(after[-40:]) > 1e-3
+
+
+def test_a_connection_over_which_nothing_comes_is_noticed_and_made_anew(served, monkeypatch):
+    monkeypatch.setattr("nafir_client.stream._SILENCE_S", 1.0)
+
+    async def listen():
+        async with proxy(served) as way, connect(way.address, reconnect=SOON) as stream:
+            before = await blocks_of(stream, 20)
+            way.silence()
+            while stream.statistics.reconnections == 0:
+                after = await blocks_of(stream, 1)
+            return before, after
+
+    before, after = running(listen())
+    assert after[0].sample_clock > before[-1].sample_clock
 
 
 def test_a_stream_that_is_not_to_come_back_ends_with_its_connection(served):

@@ -126,10 +126,7 @@ class Client:
         return ImpulseResponses(np.asarray(arrays["responses"], np.float32), int(arrays["sample_rate"]))
 
     def _get_json(self, path: str) -> Any:
-        try:
-            return json.loads(self._get(path))
-        except ValueError as exc:
-            raise ProtocolError(f"{self._base}/{path}: the answer is no JSON") from exc
+        return _read_json(f"{self._base}/{path}", self._get(path))
 
     def _get(self, path: str, query: _Query | None = None) -> bytes:
         given = {name: value for name, value in (query or {}).items() if value is not None}
@@ -157,6 +154,13 @@ def refused(url: str, status: int, body: bytes, retry_after: str | None) -> Unre
         return UnreachableError(url, f"HTTP status {status}", is_passing=status in {429, 502, 503, 504})
     advised_s = float(retry_after) if retry_after is not None and retry_after.isdigit() else None
     return RefusedError(code, detail, field=problem.get("field"), retry_after_s=advised_s)
+
+
+def _read_json(url: str, data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError as exc:
+        raise ProtocolError(f"{url}: the answer is no JSON") from exc
 
 
 def _array(data: bytes) -> Any:

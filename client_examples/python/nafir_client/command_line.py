@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
     command.add_argument("--sample-rate", type=int, help="in Hz; default: the scene's")
     command.add_argument("-o", "--output", type=Path, help="WAV file to write, beside it the path as a CSV file")
     command.add_argument("--silent", dest="is_silent", action="store_true", help="write only, without a sound card")
-    command.add_argument("--device", help="sound card: a name or number of sounddevice's")
+    command.add_argument("--device", default="", help="sound card: a name or number of sounddevice's")
     wish = {name: value for name, value in vars(parser.parse_args(arguments)).items() if name != "command"}
     try:
         listen(Listening(**wish), print)

@@ -80,6 +80,10 @@ class MissingExtraError(NafirClientError):
         super().__init__(f"{purpose} needs {library}: pip install 'nafir-client[{extra}]'")
 
 
+class MissingLibraryError(NafirClientError):
+    """A part of the package needs a library of the system that is not installed."""
+
+
 class ClosedError(NafirClientError):
     """The stream has been closed by this client."""
 

@@ -33,9 +33,9 @@ _KEY = "NAFIR_API_KEY"
 @dataclass(frozen=True)
 class Listening:
     """What to listen to. The walk takes `walk_s` one way, and goes back and forth until `seconds` have passed. With
-    `stays` the listener stays at the start. Sound is played, unless `is_silent`, by the sound card `device`, and
-    written to `output`, beside it the path as it was heard. Without an `api_key` that of the environment is used,
-    NAFIR_API_KEY."""
+    `stays` the listener stays at the start. Sound is played, unless `is_silent`, by the sound card of the name or
+    number `device`, and written to `output`, beside it the path as it was heard. Without an `api_key` that of the
+    environment is used, NAFIR_API_KEY."""
 
     url: str
     scene: str = "apartment"
@@ -47,7 +47,7 @@ class Listening:
     sample_rate: int | None = None
     output: Path | None = None
     is_silent: bool = False
-    device: str | int | None = None
+    device: str = ""
     api_key: str | None = None
 
 
@@ -125,7 +125,8 @@ def listen(wish: Listening, say: Callable[[str], None]) -> None:
     with stream, contextlib.ExitStack() as opened:
         show = opened.enter_context(_shown(meter, stream))
         if not wish.is_silent:
-            opened.enter_context(Player(stream, device=wish.device))
+            device = int(wish.device) if wish.device.isdigit() else wish.device or None
+            opened.enter_context(Player(stream, device=device))
         start_clock = _walk(wish, stream, path, show)
         rate, counts = stream.sample_rate, stream.statistics
         if stream.failure is not None:

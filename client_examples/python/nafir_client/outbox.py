@@ -15,8 +15,11 @@ _MOST_KEPT: Final = 1_000
 
 @dataclass(frozen=True)
 class Outgoing:
+    """A message. `adds` is the id of the emitter that it adds, if it adds one."""
+
     data: str | bytes
     is_counted: bool = False
+    adds: str | None = None
 
 
 class Outbox:
@@ -48,6 +51,11 @@ class Outbox:
             self._sent.append(message)
             self._sent_count += 1
         return message.data
+
+    @property
+    def adds(self) -> set[str]:
+        """Ids of emitters that waiting messages add."""
+        return {message.adds for message in self._waiting.values() if message.adds is not None}
 
     def begin(self) -> None:
         """A new stream begins, of which nothing waits and nothing was sent."""

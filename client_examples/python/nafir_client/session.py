@@ -12,6 +12,7 @@ from typing import Any, Literal, TypedDict
 
 from nafir_client.errors import ProtocolError, RefusedError
 from nafir_client.live_input import LiveInput
+from nafir_client.opus import OpusReader, require_opus
 from nafir_client.outbox import Outbox, Outgoing
 from nafir_client.pose import Orientation, Pose, Position
 from nafir_client.scene import Welcome
@@ -21,9 +22,11 @@ from nafir_client.wire import (
     PROTOCOL,
     Block,
     Encoding,
+    SampleEncoding,
     Samples,
     dry_bytes,
     parse_block,
+    parse_packets,
     pose_bytes,
 )
 
@@ -40,12 +43,14 @@ class StreamOptions(TypedDict, total=False):
     """What may be said of a stream when it is opened; the server's reference has the meaning of each.
 
     `listener` is the pose with which it begins. `emitters` is how many emitters are to come. `level` is a quality level
-    or `auto`. `order` is that of the output `ambisonics`. `effects` switches effects on or off.
+    or `auto`. `opus` says how the encoding `opus` encodes. `order` is that of the output `ambisonics`. `effects`
+    switches effects on or off.
     """
 
     sample_rate: int
     block_size: Literal[128, 256, 512, 1024]
     encoding: Encoding
+    opus: Mapping[str, Any]
     buffer_blocks: int
     output: Literal["headphones", "mono", "ambisonics"]
     order: Literal[1, 2, 3]
@@ -108,11 +113,14 @@ class SessionEmitter:
 
 
 class Session:
-    """The state of one stream. Every method that has something to send puts it into `outbox`."""
+    """The state of one stream. Every method that has something to send puts it into `outbox`. Raises
+    MissingLibraryError for a stream in Opus where there is no libopus."""
 
     def __init__(self, scene: str, options: StreamOptions) -> None:
         given: dict[str, Any] = {"block_size": 256, "encoding": "f32", "level": "auto", **options}
         self.listener: Pose | None = given.pop("listener", None)
+        if given["encoding"] == "opus":
+            require_opus()
         self._hello = {"type": "hello", "protocol": PROTOCOL, "scene": scene, **given}
         self.outbox = Outbox()
         self.emitters: dict[str, SessionEmitter] = {}
@@ -131,6 +139,7 @@ class Session:
         self._resume_token: str | None = None
         self._last_block: tuple[int, int] | None = None
         """The number and the server's clock of the newest block."""
+        self._packets: OpusReader | None = None
         self._restored: list[SessionEmitter] = []
         """What a new stream is to have of the last one."""
         self._pings: dict[int, float] = {}
@@ -179,15 +188,16 @@ class Session:
         self._resume_token = answer.get("resume_token")
         resumed = answer.get("resumed")
         if resumed is not None:
-            self._resume(resumed["pose_id"], resumed["handled"], now_s)
+            self._resume(resumed["pose_id"], resumed["handled"], resumed["sample_clock"], now_s)
         else:
             if not is_first:
                 self._clock_offset = self._continued(self.welcome, now_s)
+            self._packets = _packet_reader(self.welcome)
             self.outbox.put_first([self._added(emitter) for emitter in self._restored])
         return self.welcome
 
-    def _resume(self, pose_id: int, handled: int, now_s: float) -> None:
-        """The stream goes on where it was: what the server has not got is sent again."""
+    def _resume(self, pose_id: int, handled: int, sample_clock: int, now_s: float) -> None:
+        """The stream goes on where it would be: what the server has not got is sent again."""
         self.outbox.resume(handled)
         if self.listener is not None and self._listener_pose_id > pose_id:
             self.move_listener(self.listener, now_s)
@@ -195,6 +205,9 @@ class Session:
             if emitter.pose_id > pose_id:
                 orientation = emitter.fields.get("orientation")
                 self.move_emitter(emitter, emitter.fields["position"], orientation, now_s)
+            if not emitter.is_heard and emitter.id not in self.outbox.adds:
+                # It is there, and that it is heard may have been said just before the connection was lost.
+                emitter.is_heard, emitter.start_clock = True, sample_clock + self._clock_offset
             if emitter.live and emitter.is_heard:
                 emitter.live.open()
 
@@ -286,7 +299,8 @@ class Session:
                     self._put_dry(emitter, emitter.live, samples)
 
     def _put_dry(self, emitter: SessionEmitter, live: LiveInput, samples: Samples) -> None:
-        encoding: Encoding = "s16" if self._hello["encoding"] == "s16" else "f32"
+        # Of the encodings without frames of their own, the shorter one where bandwidth matters.
+        encoding: SampleEncoding = "f32" if self._hello["encoding"] == "f32" else "s16"
         self.outbox.put(Outgoing(dry_bytes(emitter.id, live.sequence, samples, encoding)))
         live.sequence += 1
 
@@ -296,7 +310,7 @@ class Session:
         for name in ("start_at", "stop_at"):
             if name in fields:
                 fields[name] = max(0, fields[name] - self._clock_offset)
-        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True)
+        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True, adds=emitter.id)
 
     def _put(self, message: Mapping[str, Any], key: object = None) -> None:
         self.outbox.put(Outgoing(json.dumps(message), is_counted=message["type"] not in _UNCOUNTED), key)
@@ -310,12 +324,15 @@ class Session:
     def _receive_block(self, data: bytes, now_s: float) -> Block:
         welcome, counts = self.welcome, self.statistics
         assert welcome is not None
-        block = parse_block(data, welcome.encoding, now_s, self._clock_offset)
+        if self._packets is None:
+            block = parse_block(data, welcome.encoding, now_s, self._clock_offset)
+        else:
+            block = parse_packets(data, self._packets, now_s, self._clock_offset)
         frames = block.sample_clock + block.frames - self.next_clock
         counts.blocks += 1
         counts.blocks_late += block.is_late
         counts.blocks_limited += block.is_limited
-        counts.blocks_skipped += (block.sample_clock - self.next_clock) // block.frames
+        counts.blocks_skipped += max(0, block.sample_clock - self.next_clock) // welcome.block_size
         counts.pose_to_sound.receive(block.pose_id, now_s)
         counts.pose_to_reverberation.receive(block.reverberation_pose_id, now_s)
         self.next_clock = block.sample_clock + block.frames
@@ -375,6 +392,14 @@ class Session:
         if error.code not in _REFUSALS_OF_FORM:
             return None
         return next((each for each in self.emitters.values() if not each.is_heard), None)
+
+
+def _packet_reader(welcome: Welcome) -> OpusReader | None:
+    """What decodes a stream in Opus; None for one of single samples."""
+    if welcome.encoding != "opus":
+        return None
+    opus = welcome.given["opus"]
+    return OpusReader(welcome.sample_rate, list(opus["streams"]), opus["look_ahead"])
 
 
 def refusal(message: Message) -> RefusedError:

@@ -40,6 +40,7 @@ from nafir_client.wire import Block
 
 T = TypeVar("T")
 _OPEN_S = 10.0
+_CLOSE_S = 1.0
 _WELCOME_S = 30.0
 """How long the server may take to answer a hello: it may measure what ambisonics of a scene cost first."""
 _PING_EVERY_S = 1.0
@@ -385,6 +386,7 @@ class Stream:
                 max_size=None,
                 additional_headers=self._headers,
                 open_timeout=_OPEN_S,
+                close_timeout=_CLOSE_S,
                 ping_interval=_SILENCE_S / 2,
                 ping_timeout=_SILENCE_S / 2,
             )
@@ -406,6 +408,10 @@ class Stream:
             await socket.close()
             raise
         self.is_connected = True
+        for identifier, added in self._adding.items():
+            state = self._session.emitters.get(identifier)
+            if state is not None and state.is_heard and not added.done():
+                added.set_result(None)
         return socket
 
     async def _run(self, socket: ClientConnection) -> None:

@@ -5,8 +5,8 @@ The server's reference page on the live stream has every byte.
 
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,8 @@ from nafir_client.errors import ProtocolError
 from nafir_client.pose import Pose
 
 Samples = npt.NDArray[np.float32]
-Encoding = Literal["f32", "s16"]
+SampleEncoding = Literal["f32", "s16"]
+Encoding = Literal[SampleEncoding, "opus"]
 
 PROTOCOL: Final = 3
 BLOCK_KIND, POSE_KIND, DRY_KIND = 1, 2, 3
@@ -25,7 +26,7 @@ POSE: Final = struct.Struct("<B3xI7f")
 """Kind, pose id, position, orientation."""
 DRY: Final = struct.Struct("<BBHII")
 """Kind, encoding, bytes of the id, sequence, frames; then the id, filled up to four bytes, and the samples."""
-EXCHANGE, LATE, LIMITED = 1, 2, 4
+EXCHANGE, LATE, LIMITED, RESTART = 1, 2, 4, 8
 """Flags of an audio block."""
 ENCODINGS: Final = ("f32", "s16")
 """In the order of their numbers in dry blocks."""
@@ -53,8 +54,8 @@ class Block:
 
     `sample_clock` is the clock of the first frame. It jumps over blocks that the server skipped. `pose_id` is the
     newest pose of the direct sound, `reverberation_pose_id` that of the reflected field; with `is_exchange` this block
-    fades to it. The server sent the block too late where `is_late`, and turned it down where `is_limited`.
-    `arrived_s` is when it arrived, by `time.monotonic`.
+    fades to it. The server sent the block too late where `is_late`, and turned it down where `is_limited`. A block in
+    Opus may have no frames. `arrived_s` is when it arrived, by `time.monotonic`.
     """
 
     sequence: int
@@ -84,24 +85,48 @@ _DECODERS: Final[Mapping[str, Callable[[bytes, int], Samples]]] = {"f32": _from_
 
 
 def parse_block(data: bytes, encoding: str, arrived_s: float, clock_offset: int = 0) -> Block:
-    """Read a block, and add to its clock. Raises ProtocolError unless the bytes are one whole block."""
-    if len(data) < BLOCK.size:
-        raise ProtocolError(f"an audio block has at least {BLOCK.size} bytes, not {len(data)}")
-    _, flags, channels, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
+    """Read a block of an encoding of single samples, and add to its clock. Raises ProtocolError unless the bytes are
+    one whole block."""
+    block, channels, frames = _parse_header(data, arrived_s, clock_offset)
     try:
         samples = _DECODERS[encoding](data, BLOCK.size).reshape(frames, channels)
     except ValueError as exc:
         raise ProtocolError(f"an audio block of {frames} frames has {len(data)} bytes") from exc
+    return replace(block, samples=samples)
+
+
+class PacketReader(Protocol):
+    """Decodes packets from a byte of a block on to samples (frame, channel). Raises ProtocolError."""
+
+    def read(self, data: bytes, offset: int, *, is_restart: bool) -> Samples: ...
+
+
+def parse_packets(data: bytes, reader: PacketReader, arrived_s: float, clock_offset: int = 0) -> Block:
+    """Read a block that holds packets, the next of a stream. Raises ProtocolError."""
+    block, channels, frames = _parse_header(data, arrived_s, clock_offset)
+    samples = reader.read(data, BLOCK.size, is_restart=bool(data[1] & RESTART))
+    if samples.shape != (frames, channels):
+        raise ProtocolError(f"an audio block of {frames} frames decodes to {len(samples)}")
+    return replace(block, samples=samples)
+
+
+def _parse_header(data: bytes, arrived_s: float, clock_offset: int) -> tuple[Block, int, int]:
+    """A block without its samples, and how many channels and frames it has."""
+    if len(data) < BLOCK.size:
+        raise ProtocolError(f"an audio block has at least {BLOCK.size} bytes, not {len(data)}")
+    _, flags, channels, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
     is_exchange, is_late, is_limited = (bool(flags & bit) for bit in (EXCHANGE, LATE, LIMITED))
     clock += clock_offset
-    return Block(sequence, clock, pose, reverberation_pose, samples, is_exchange, is_late, is_limited, arrived_s)
+    silence = np.zeros((0, channels), np.float32)
+    block = Block(sequence, clock, pose, reverberation_pose, silence, is_exchange, is_late, is_limited, arrived_s)
+    return block, channels, frames
 
 
 def pose_bytes(pose: Pose, pose_id: int) -> bytes:
     return POSE.pack(POSE_KIND, pose_id, *pose.position, *pose.orientation)
 
 
-def dry_bytes(emitter: str, sequence: int, samples: Samples, encoding: Encoding) -> bytes:
+def dry_bytes(emitter: str, sequence: int, samples: Samples, encoding: SampleEncoding) -> bytes:
     """The next samples (n,) of a live emitter, n at least 1. Samples that are no numbers become silence."""
     identifier = emitter.encode()
     header = DRY.pack(DRY_KIND, ENCODINGS.index(encoding), len(identifier), sequence, len(samples))
