@@ -24,6 +24,7 @@ from server.api.access import Access, AccessError, Caller
 from server.api.api_keys import SCOPES
 from server.api.connection_limits import HEALTH_PATHS
 from server.api.problems import Refusal, refuse
+from server.runtime.logs import about
 
 KEY_PROTOCOL: Final = "nafir.key."
 """Begins the subprotocol that carries a key."""
@@ -96,6 +97,8 @@ class AccessGate:
             await refuse(admitted, scope, receive, send)
         else:
             caller = None if isinstance(admitted, Refusal) else admitted
+            if caller is not None:
+                about(caller=caller.name)
             await self._app({**_without_keys(scope), "nafir.caller": caller}, receive, send)
 
     def _admit(self, method: str, path: str, scope: Scope) -> Caller | Refusal:

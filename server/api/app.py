@@ -27,6 +27,7 @@ from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
 from server.api.process_peers import ProcessPeers
+from server.api.request_log import RequestLog
 from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
 from server.api.settings import Settings, usable_cores
@@ -177,7 +178,8 @@ def create_app(
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     if access is not None:
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
-    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outermost: gives refusals their CORS headers
+    app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outside the others: gives refusals CORS headers
+    app.add_middleware(RequestLog)
     if settings.page:
         app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app

@@ -18,6 +18,7 @@ to the task, and a session in that cycle would stay in memory until the garbage 
 import asyncio
 import contextlib
 import dataclasses
+import logging
 import math
 import re
 import time
@@ -87,6 +88,7 @@ from server.protocol.server_messages import EmitterEnded, Error, Pong, Resumed, 
 from server.protocol.snapshot import MOST_BYTES, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
+from server.runtime.logs import about
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
@@ -101,6 +103,8 @@ from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.render_costs import kind_of, measure_rendering
 from server.streaming.session import Session
 from server.streaming.stream import Outgoing, Stream, StreamFailed, StreamState, TimedBlock
+
+_logger = logging.getLogger(__name__)
 
 MAX_WAITING_ANSWERS = 256
 SUBPROTOCOL: Final = f"nafir.v{PROTOCOL}"
@@ -366,6 +370,10 @@ class Connection:
         self._handled = 0
         self._state: asyncio.Future[StreamState] | None = None
         """The state that the audio thread was asked for."""
+        self._left_with = NORMAL
+        """The close code with which the client left, if it did."""
+        self._figures: dict[str, float] | None = None
+        """What is told of a stream when it has ended."""
 
     async def run(self) -> None:
         """Serve the client until either side ends it."""
@@ -376,8 +384,20 @@ class Connection:
             offered = self._websocket.scope.get("subprotocols", ())
             await self._websocket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
             goodbye = await self._serve_until_drained()
+            self._log_end(goodbye)
             if goodbye is not None:
                 await self._say(goodbye)
+
+    def _log_end(self, goodbye: Goodbye | None) -> None:
+        """Say why a connection has ended."""
+        reason: dict[str, object] = {"reason": "client_left", "close_code": self._left_with}
+        if goodbye is not None:
+            error = goodbye.error
+            reason = {"reason": error.code, "close_code": goodbye.close_code, "detail": error.message}
+        if self._figures is None:
+            _logger.info("stream not opened", extra=reason)
+        else:
+            _logger.info("stream ended", extra={"session": self._session, **reason, **self._figures})
 
     async def _say(self, goodbye: Goodbye) -> None:
         with contextlib.suppress(TimeoutError):
@@ -641,6 +661,12 @@ class Connection:
         """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
         self._stream, self._place = stream, place
         self._has_resumed = True
+        about(session=self._session)
+        _logger.info(
+            "stream opened",
+            extra={"scene": hello.scene, "quality": stream.session.quality.level, "encoding": hello.encoding},
+        )
+        opened_s = self._time_s()
         self._host.ledger.open(stream)
         self._host.audio.open(stream)
         reading = asyncio.create_task(self._read_incoming(stream, hello))
@@ -665,6 +691,11 @@ class Connection:
             self._host.audio.close(stream)
             self._host.ledger.close(stream)
             self._stream = self._place = None
+            self._figures = {
+                "duration_s": round(self._time_s() - opened_s, 3),
+                "blocks_sent": stream.session.window.sent,
+                "blocks_late": stream.blocks_late,
+            }
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
@@ -790,7 +821,8 @@ class Connection:
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()
         if event["type"] == "websocket.disconnect":
-            raise WebSocketDisconnect(event.get("code", NORMAL))
+            self._left_with = event.get("code", NORMAL)
+            raise WebSocketDisconnect(self._left_with)
         text: str | None = event.get("text")
         return event["bytes"] if text is None else text
 

@@ -29,9 +29,9 @@ from server.api.settings import Settings
 
 _ANY = "*"
 _USUAL_PORTS = {"http": 80, "https": 443}
-_EXPOSED = ("ETag", "Retry-After", "WWW-Authenticate")
+_EXPOSED = ("ETag", "Retry-After", "WWW-Authenticate", "X-Request-ID")
 _METHODS = ("GET", "HEAD", "POST", "DELETE")
-_HEADERS = ("Authorization", "Content-Type", "If-None-Match", "Range")
+_HEADERS = ("Authorization", "Content-Type", "If-None-Match", "Range", "X-Request-ID")
 _DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
 _FOR_PROGRAMS = ("/v1/", "/metrics")
 """Paths for programs, to which no link of a page leads."""

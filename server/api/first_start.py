@@ -6,6 +6,7 @@ what the process has compiled.
 """
 
 import asyncio
+import logging
 import subprocess
 import sys
 import threading
@@ -24,6 +25,8 @@ from server.scene.bundle import Bundle
 from server.streaming.calibration import calibrate
 
 _TOLD_EVERY_S = 5.0
+
+_logger = logging.getLogger(__name__)
 
 
 class CompilingProcess:
@@ -69,7 +72,7 @@ class CompilingProcess:
 
 
 async def tell_while_compiling() -> None:
-    """Write a line to standard error every few seconds while functions are compiled, until cancelled."""
+    """Write a line to the log every few seconds while functions are compiled, until cancelled."""
     started_s, known = time.monotonic(), functions_compiled()
     while True:
         await asyncio.sleep(_TOLD_EVERY_S)
@@ -77,8 +80,7 @@ async def tell_while_compiling() -> None:
         if count > known:
             known = count
             passed_s = time.monotonic() - started_s
-            sys.stderr.write(f"Compiling for this processor, once: {count} functions in {passed_s:.0f} s ...\n")
-            sys.stderr.flush()
+            _logger.info("compiling for this processor, once: %d functions in %.0f s", count, passed_s)
 
 
 def _compile(folder: Path) -> None:

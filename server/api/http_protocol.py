@@ -7,6 +7,7 @@ overdue ones are ended.
 """
 
 import asyncio
+import logging
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,9 @@ _RETRY_AFTER_S = 10
 _HEALTH = frozenset(path.encode() for path in HEALTH_PATHS)
 _MALFORMED = Refusal(400, "malformed_request", "that is not HTTP/1.1")
 _NO_ROOM = Refusal(503, "too_many_connections", "the server has no free connection: ask again later")
+
+
+_logger = logging.getLogger(__name__)
 
 
 def limited_http(limits: ConnectionLimits) -> Any:
@@ -296,7 +300,10 @@ class HttpProtocol(HttpToolsProtocol):
         self._is_last = True
         self._unset_keepalive_if_required()
         if not self._has_head or not self.cycle.response_started:
-            self.logger.info("%s is refused: %d %s", self.client, refusal.status, refusal.code)
+            client = self.client[0] if self.client else None
+            _logger.info(
+                "request refused unread", extra={"status": refusal.status, "code": refusal.code, "client": client}
+            )
             self.transport.write(_answer(refusal, self.server_state.default_headers))
         elif not self.cycle.response_complete:
             self.transport.abort()

@@ -36,10 +36,12 @@ def _serve(told: dict[str, Any]) -> None:
     from server.api.settings import checked_settings
     from server.api.start import loaded_app
     from server.runtime.drain import Drain
+    from server.runtime.logs import configure_logs
     from server.runtime.memory import give_back_large_arrays
 
     give_back_large_arrays()
     settings = checked_settings(told["options"])
+    configure_logs(settings.log_format, settings.log_level)
     drain = Drain(settings.drain_s)
     # Not among the arguments, which other users of the machine can see.
     peers = ProcessPeers(told["number"], tuple(told["ports"]), os.environ.pop(KEY_VARIABLE, None))

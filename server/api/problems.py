@@ -9,6 +9,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
+from server.api.request_log import REQUEST_ID
 from server.core.errors import RequestError
 from server.protocol.codes import POLICY_VIOLATION
 
@@ -82,8 +83,11 @@ def install_problems(app: FastAPI) -> None:
         response.headers.update(exc.headers or {})
         return response
 
-    async def crashed(_: Request, __: Exception) -> JSONResponse:
-        return problem(500, "internal_error", "the server failed to answer; its log says why")
+    async def crashed(request: Request, _: Exception) -> JSONResponse:
+        response = problem(500, "internal_error", "the server failed to answer; its log says why")
+        if (identifier := request.scope.get(REQUEST_ID)) is not None:
+            response.headers[REQUEST_ID] = identifier
+        return response
 
     app.add_exception_handler(RequestError, refused)
     app.add_exception_handler(RequestValidationError, invalid)

@@ -56,6 +56,8 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
         "ws": "server.api.web_socket:WebSocketProtocol",
         "ws_max_size": settings.max_frame_bytes,
         "ws_per_message_deflate": False,
+        "log_config": None,  # `server.runtime.logs` writes all logs, and `server.api.request_log` those of requests
+        "access_log": False,
     }
 
 

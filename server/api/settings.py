@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -97,6 +97,10 @@ class Settings(BaseSettings):
     """Whether the server refuses to start without keys. Without it, one that others can reach warns."""
     page: bool = True
     """Whether the server has a page. Its files need no key."""
+    log_format: Literal["console", "json"] = "console"
+    """How `nafir serve` writes its log to standard error: lines for people, or JSON for programs."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least important lines that are written."""
     bundles: Paths = ()
     """Scene bundles to serve besides those that come with the package."""
     offer_bundles: bool = True

@@ -104,9 +104,11 @@ def serve(
     """
     from server.api.listeners import bind, url_of
     from server.api.settings import checked_settings
+    from server.runtime.logs import configure_logs
 
     given = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf, "processes": processes}
     settings = checked_settings(given)
+    configure_logs(settings.log_format, settings.log_level)
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
         listeners = [opened.enter_context(listener) for listener in bind(settings.host, settings.port)]

@@ -1,0 +1,94 @@
+"""A line in the log for each request and each refused handshake, and an id by which it is found again.
+
+The id is that of the request's `X-Request-ID` if it is a plain word, and random otherwise. The answer has it, and so
+has every line that is written on the way, that of a stream included.
+"""
+
+import json
+import logging
+import re
+import time
+import uuid
+from collections.abc import Callable
+from typing import Final
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.runtime.logs import begin_about
+
+REQUEST_ID: Final = "X-Request-ID"
+_PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_QUIET: Final = frozenset({"/livez", "/readyz", "/metrics", "/metrics/process"})
+"""Paths that are asked for every few seconds: only what goes wrong with them is written."""
+_CLIENT_CLOSED_REQUEST = 499
+
+_logger = logging.getLogger(__name__)
+
+
+def request_id(headers: Headers) -> str:
+    """The id of a request, as its client gave it or a new one."""
+    given = headers.getlist(REQUEST_ID)
+    return given[0] if len(given) == 1 and _PLAIN.fullmatch(given[0]) else uuid.uuid4().hex
+
+
+class RequestLog:
+    """ASGI middleware, the outermost."""
+
+    def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.perf_counter) -> None:
+        self._app = app
+        self._time_s = time_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in {"http", "websocket"}:
+            await self._app(scope, receive, send)
+            return
+        identifier = request_id(Headers(scope=scope))
+        begin_about(request_id=identifier)
+        scope[REQUEST_ID] = identifier  # for the answer to a request that fails, which is given outside of this
+        status, code, is_problem, started_s = None, None, False, self._time_s()
+
+        async def send_noted(message: Message) -> None:
+            nonlocal status, code, is_problem
+            match message["type"]:
+                case "http.response.start" | "websocket.http.response.start":
+                    headers = MutableHeaders(scope=message)
+                    headers[REQUEST_ID] = identifier
+                    status, is_problem = message["status"], "problem+json" in headers.get("content-type", "")
+                case "http.response.body" | "websocket.http.response.body" if is_problem:
+                    is_problem, code = False, _code_of(message.get("body", b""))
+                case "websocket.accept":
+                    given = (REQUEST_ID.lower().encode(), identifier.encode())
+                    message = {**message, "headers": [*message.get("headers", ()), given]}
+                    status = 101
+                case "websocket.close" if status is None:
+                    status, code = 403, message.get("reason")
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_noted)
+        except Exception:
+            status, code = status or 500, code or "internal_error"
+            raise
+        finally:
+            if status != 101 and not (scope["path"] in _QUIET and status == 200):
+                _logger.info(
+                    "request",
+                    extra={
+                        "method": scope.get("method", "WEBSOCKET"),
+                        "path": scope["path"],  # without the query, in which people put keys
+                        "status": _CLIENT_CLOSED_REQUEST if status is None else status,
+                        **({} if code is None else {"code": code}),
+                        "duration_ms": round(1000 * (self._time_s() - started_s), 1),
+                        "client": scope["client"][0] if scope.get("client") else None,
+                    },
+                )
+
+
+def _code_of(document: bytes) -> str | None:
+    """The code of a problem document; None if it has none, as the answer to a HEAD."""
+    try:
+        code = json.loads(document).get("code")
+    except (ValueError, AttributeError):
+        return None
+    return code if isinstance(code, str) else None

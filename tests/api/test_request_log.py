@@ -1,0 +1,111 @@
+import logging
+
+import pytest
+from starlette.applications import Starlette
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.testclient import TestClient, WebSocketDenialResponse
+
+from server.api import request_log
+from server.api.problems import problem
+from server.api.request_log import REQUEST_ID, RequestLog
+
+
+@pytest.fixture
+def client():
+    async def good(_):
+        return PlainTextResponse("heard")
+
+    async def refused(_):
+        return problem(409, "map_too_fine", "no")
+
+    async def failing(_):
+        raise ValueError("a fault")
+
+    async def bare(_):
+        return Response(b"not JSON", 400, media_type="application/problem+json")
+
+    async def stream(websocket):
+        if "deny" in websocket.query_params:
+            await websocket.send_denial_response(problem(401, "key_required", "no"))
+        elif "close" in websocket.query_params:
+            await websocket.close(1008, "origin_not_allowed")
+        else:
+            await websocket.accept(headers=[(b"x-own", b"1")])
+            await websocket.close()
+
+    routes = [
+        Route("/v1/good", good),
+        Route("/livez", good),
+        Route("/metrics", refused),
+        Route("/v1/refused", refused),
+        Route("/v1/failing", failing),
+        Route("/v1/bare", bare),
+        WebSocketRoute("/v1/stream", stream),
+    ]
+    return TestClient(RequestLog(Starlette(routes=routes)), raise_server_exceptions=False)
+
+
+@pytest.fixture
+def logged(caplog):
+    """The fields of the lines since the last call."""
+    caplog.set_level(logging.INFO, request_log.__name__)
+    names = ("method", "path", "status", "code", "client")
+
+    def logged():
+        records = [record for record in caplog.records if record.name == request_log.__name__]
+        lines = [tuple(getattr(record, name, None) for name in names) for record in records]
+        assert all(record.duration_ms >= 0 for record in records)
+        caplog.clear()
+        return lines
+
+    return logged
+
+
+def test_every_request_has_a_line_without_its_query(client, logged):
+    client.get("/v1/good?key=nafir_secret")
+    assert logged() == [("GET", "/v1/good", 200, None, "testclient")]
+    client.post("/v1/refused")
+    client.get("/v1/refused")
+    client.get("/nowhere")
+    assert [line[:4] for line in logged()] == [
+        ("POST", "/v1/refused", 405, None),
+        ("GET", "/v1/refused", 409, "map_too_fine"),
+        ("GET", "/nowhere", 404, None),
+    ]
+    client.get("/v1/bare")
+    assert logged()[0][2:4] == (400, None)
+    with pytest.raises(ValueError, match="a fault"):
+        TestClient(client.app).get("/v1/failing")
+    assert logged()[0][2:4] == (500, "internal_error")
+
+
+def test_health_checks_have_lines_only_if_they_fail(client, logged):
+    client.get("/livez")
+    assert logged() == []
+    client.get("/metrics")
+    assert [line[:4] for line in logged()] == [("GET", "/metrics", 409, "map_too_fine")]
+
+
+def test_a_refused_handshake_has_a_line(client, logged):
+    for query, status, code in (("?deny", 401, "key_required"), ("?close", 403, "origin_not_allowed")):
+        with pytest.raises((WebSocketDenialResponse, Exception)), client.websocket_connect(f"/v1/stream{query}"):
+            pass
+        assert [line[:4] for line in logged()] == [("WEBSOCKET", "/v1/stream", status, code)]
+    with client.websocket_connect("/v1/stream") as socket:
+        headers = dict(socket.extra_headers)
+    assert headers[b"x-own"] == b"1"
+    assert len(headers[REQUEST_ID.lower().encode()]) == 32
+    assert logged() == []  # the stream's own lines say what became of it
+
+
+def test_an_id_is_taken_over_if_it_is_a_plain_word(client):
+    assert client.get("/v1/good", headers={REQUEST_ID: "trace-1.A_b"}).headers[REQUEST_ID] == "trace-1.A_b"
+    made = {client.get("/v1/refused").headers[REQUEST_ID] for _ in range(3)}
+    assert len(made) == 3
+    for odd in ("", "two words", "x" * 65, "a,b", "<script>", "ä", "a\tb"):
+        answered = client.get("/v1/good", headers={REQUEST_ID: odd.encode()}).headers[REQUEST_ID]
+        assert answered != odd
+        assert len(answered) == 32
+    twice = client.get("/v1/good", headers=[(REQUEST_ID, "a"), (REQUEST_ID, "b")]).headers[REQUEST_ID]
+    assert twice not in {"a", "b", "a, b"}
