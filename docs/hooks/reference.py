@@ -10,6 +10,7 @@ from typing import Any, Final
 from reference_commands import commands_of
 from reference_errors import error_definitions
 from reference_goals import bench_goals
+from reference_limits import limits
 from reference_load import admission_limits, load_thresholds
 from reference_packages import package_matrix, packages
 from reference_schemas import manifest, settings
@@ -19,6 +20,7 @@ GENERATORS: Final[Mapping[str, Callable[[], str]]] = {
     "nafir": lambda: commands_of("server.cli.main", "nafir"),
     "nafir-train": lambda: commands_of("training.cli.main", "nafir-train"),
     "settings": settings,
+    "limits": limits,
     "http": http,
     "stream": stream,
     "manifest": manifest,

@@ -27,6 +27,7 @@ from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
 from server.api.process_peers import ProcessPeers
+from server.api.rate_limits import RateGate, RateLimits, address_of, key_of
 from server.api.request_log import RequestLog
 from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
@@ -176,8 +177,11 @@ def create_app(
     install_openapi(app, is_protected=access is not None)
     app.add_middleware(Compression)
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
+    rate_limits = RateLimits.of(settings)
     if access is not None:
+        app.add_middleware(RateGate, limits=rate_limits, actor=key_of)
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
+    app.add_middleware(RateGate, limits=rate_limits, actor=address_of)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outside the others: gives refusals CORS headers
     app.add_middleware(RequestLog)
     if settings.page:

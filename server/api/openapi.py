@@ -21,7 +21,7 @@ _REFUSED: Final[dict[str, str]] = {
     "414": "The URL is longer than the server takes.",
     "421": "The server does not answer for this host name.",
     "422": "A parameter is malformed, unknown, missing or given twice; `field` names it.",
-    "429": "One address has more requests or connections than the server takes.",
+    "429": "One address or one key has more requests, streams or uploads than it may.",
     "431": "The headers are longer than the server takes.",
     "500": "The server failed to answer.",
     "503": "The server is warming up, busy or shutting down.",

@@ -44,6 +44,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "too_many_emitters": "422: a plan is asked for with more emitters than a stream may have",
     "too_many_headers": "431: the request has more headers than the server takes",
     "too_many_poses": "422: more impulse responses are asked for than one request may; send several",
+    "too_many_requests": "429: one address or one key asks, opens streams or uploads too fast; wait for `Retry-After`",
     "unknown_effect": "422: there is no effect of this name; the message lists those there are",
     "unknown_file": "404: the scene's bundle has no file of this name",
     "unknown_format": "422: the answer cannot be written in this format",

@@ -159,6 +159,13 @@ class Settings(BaseSettings):
     """Longest body of a request."""
     max_poses: Annotated[int, Field(ge=1)] = 256
     """Impulse responses that one request may ask for."""
+    requests_per_min: Annotated[int, Field(ge=0)] = 6_000
+    """Requests that may come at once from one address, and with one key, and as many more in every minute; one too many
+    is answered 429 with `Retry-After`. 0 sets no limit, and addresses of this machine have none."""
+    stream_openings_per_min: Annotated[int, Field(ge=0)] = 300
+    """The same for streams that are opened."""
+    upload_bytes_per_h: Annotated[int, Field(ge=0)] = 1024**3
+    """The same for bytes of clips that are uploaded, in an hour."""
     max_connections: Annotated[int, Field(ge=1)] = 1024
     """Connections in total. If all are taken, a new one replaces the one that has been idle for longest; if none is
     idle, only health checks are answered."""

@@ -45,6 +45,12 @@ def test_every_setting_is_listed_and_explained(site: Path, page: Page) -> None:
     assert [row[0] for row in cells if row and not row[-1].strip()] == []
 
 
+def test_every_limit_is_listed_where_one_secures_a_server(page: Page) -> None:
+    limits = {f"NAFIR_{name.upper()}" for name in Settings.model_fields if name.startswith("max_") or "_per_" in name}
+    assert len(limits) > 12
+    assert limits <= words(page("how-to/secure"))
+
+
 def commands(program: str, command: Any) -> Iterator[tuple[str, Any]]:
     yield program, command
     for name, each in getattr(command, "commands", {}).items():
