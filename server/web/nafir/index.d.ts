@@ -38,7 +38,7 @@ export interface Welcome {
   sample_rate: number;
   block_size: number;
   channels: number;
-  encoding: "f32" | "s16";
+  encoding: "f32" | "s16" | "opus";
   level: string;
   order?: number;
   max_emitters: number | null;
@@ -129,6 +129,15 @@ export interface Nafir extends EventTarget {
   addEventListener(type: string, listener: EventListenerOrEventListenerObject | null, options?: boolean | AddEventListenerOptions): void;
 }
 
+export interface OpusOptions {
+  frame_ms?: 5 | 10 | 20;
+  /** Of two channels, in bits per second. */
+  bitrate?: number;
+  complexity?: number;
+  application?: "low_delay" | "audio" | "voip";
+  signal?: "auto" | "voice" | "music";
+}
+
 export interface ConnectOptions {
   scene: string;
   /** An API key or token, if the server asks for one. */
@@ -141,8 +150,9 @@ export interface ConnectOptions {
   head?: string;
   /** Of ambisonics, 1 to 3: turns of the head are then heard at once. */
   order?: 1 | 2 | 3;
-  /** s16 takes half the bytes of f32, which is used if left out. */
-  encoding?: "f32" | "s16";
+  /** s16 takes half the bytes of f32, which is used if left out. opus takes a tenth, at 48 kHz; where server or browser do not have it, it is s16. */
+  encoding?: "f32" | "s16" | "opus";
+  opus?: OpusOptions;
   bufferBlocks?: number;
   /** Ends the attempt. */
   signal?: AbortSignal;

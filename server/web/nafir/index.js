@@ -9,6 +9,7 @@
 
 import { decoderUrl, fetchJson } from "./http.js";
 import { PoseLedger } from "./latency.js";
+import { decodesOpus } from "./opus.js";
 import { Output } from "./output.js";
 import { now } from "./stream.js";
 import { orientationOf } from "./wire.js";
@@ -154,9 +155,9 @@ class Nafir extends EventTarget {
 
   /** Resolves with the first welcome. Rejects with RefusedError, or with the reason of `signal`. */
   open(signal) {
-    const { scene, level, effects, encoding, bufferBlocks, order, head, key = null } = this.#options;
+    const { scene, level, effects, encoding, opus, bufferBlocks, order, head, key = null } = this.#options;
     const ambisonic = order === undefined ? {} : { output: "ambisonics", order };
-    const hello = { scene, level, effects, encoding, bufferBlocks, head: order === undefined ? head : undefined, ...ambisonic };
+    const hello = { scene, level, effects, encoding, opus, bufferBlocks, head: order === undefined ? head : undefined, ...ambisonic };
     return new Promise((resolve, reject) => {
       let code = null;
       const end = (error) => {
@@ -293,19 +294,30 @@ class Nafir extends EventTarget {
  *
  * `context` is an AudioContext of 44.1, 48 or 96 kHz, or of the scene's own rate. `url` is the server's address. Options: `scene`; `key`;
  * `listener` ({position, yaw or orientation}; without it, where a visit of the scene begins); `level`; `effects`; `head`; `order` (1 to 3:
- * the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32" or "s16", half as many bytes); `bufferBlocks`;
+ * the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32"; "s16", half as many bytes; or "opus", a tenth,
+ * which is "s16" where server, browser or rate do not allow it: `welcome.encoding` says so); `opus` (its options); `bufferBlocks`;
  * `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
  */
 export async function connect(context, url, options) {
   const { key = null, signal, assets, listener } = options;
   const api = apiOf(url);
   const at = (name) => new URL(name, new URL(assets, globalThis.location?.href));
-  const [sound, scene] = await Promise.all([
+  const [sound, encoding, scene] = await Promise.all([
     Output.in(context, assets === undefined ? undefined : at("worklet.js")),
+    options.encoding === "opus" ? opusOr("s16", context, api, { key, signal }) : options.encoding,
     listener === undefined ? fetchJson(new URL(`scenes/${encodeURIComponent(options.scene)}`, api), { key, signal }) : null,
   ]);
   const start = { position: [0, 0, 0], ...(scene?.listener ?? {}), ...listener };
   const worker = assets === undefined ? undefined : new Worker(at("stream_worker.js"), { type: "module" });
-  const nafir = new Nafir(context, api, { ...options, listener: start }, sound, new WorkerStream(worker));
+  const opus = encoding === "opus" ? options.opus : undefined;
+  const nafir = new Nafir(context, api, { ...options, encoding, opus, listener: start }, sound, new WorkerStream(worker));
   return nafir.open(signal);
+}
+
+/** "opus" where both the server and this browser have it at the context's rate, and otherwise another encoding. */
+async function opusOr(other, { sampleRate }, api, options) {
+  if (!(await decodesOpus(sampleRate))) return other;
+  const { encodings } = await fetchJson(new URL("encodings", api), options).catch(() => ({ encodings: [] })); // of a server without any
+  const found = encodings.find(({ name }) => name === "opus");
+  return found && (found.sample_rates?.includes(sampleRate) ?? true) ? "opus" : other;
 }

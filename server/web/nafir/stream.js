@@ -2,7 +2,10 @@
 // every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
 
 import { authorized } from "./http.js";
-import { FLAG_LATE, PROTOCOL, isBlock, message, parseBlock, serializeDryBlock, serializePose } from "./wire.js";
+import { OpusReader } from "./opus.js";
+import {
+  FLAG_LATE, FLAG_RESTART, PROTOCOL, isBlock, message, parseBlock, parsePackets, serializeDryBlock, serializePose,
+} from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent
 const ACKNOWLEDGE_EVERY = 4; // blocks
@@ -41,6 +44,7 @@ export class Stream {
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
   #asking = 0; // timer that asks for them again
   #encoding = "f32";
+  #opus = null; // the reader of blocks in Opus
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
@@ -144,6 +148,8 @@ export class Stream {
     clearTimeout(this.#asking);
     this.#missing.clear();
     this.#dry.clear();
+    this.#opus?.close();
+    this.#opus = null;
     clearInterval(this.#watchdog);
     clearInterval(this.#heartbeat);
     const socket = this.#socket;
@@ -235,6 +241,11 @@ export class Stream {
   #welcome(welcome) {
     this.#welcomed = true;
     this.#encoding = welcome.encoding;
+    if (welcome.opus) {
+      const deliver = (block) => this.#listeners.block(block);
+      // A browser that fails at it gets samples.
+      this.#opus = new OpusReader(welcome.opus, deliver, () => this.renew({ encoding: "s16", opus: undefined }));
+    }
     this.#attempt = 0;
     this.#lastError = null;
     this.#dirty.clear();
@@ -251,9 +262,11 @@ export class Stream {
   #receiveBlock(buffer) {
     this.#heardAt = now();
     if (!isBlock(buffer)) return; // a newer server may send other kinds
-    const block = parseBlock(buffer, this.#encoding);
+    const { header: block, packets } = this.#opus ? parsePackets(buffer) : { header: parseBlock(buffer, this.#encoding), packets: null };
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
-    this.#listeners.block({ ...block, late: (block.flags & FLAG_LATE) !== 0 });
+    const told = { ...block, late: (block.flags & FLAG_LATE) !== 0 };
+    if (packets) this.#opus.read(told, packets, (block.flags & FLAG_RESTART) !== 0);
+    else this.#listeners.block(told);
   }
 
   #schedule() {

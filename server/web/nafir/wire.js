@@ -13,6 +13,7 @@ const FULL_SCALE = 32767; // of s16
 const CHANNELS = [1, 2, 4, 9, 16];
 
 export const FLAG_LATE = 2;
+export const FLAG_RESTART = 8; // of Opus: decoders begin anew
 
 /** [x, y, z, w] of a pose that has it as `orientation`, or a `yaw` counter-clockwise from +x, or neither. */
 export const orientationOf = ({ orientation, yaw = 0 }) => orientation ?? [0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)];
@@ -46,6 +47,18 @@ export function serializeDryBlock({ id, sequence, samples }) {
 /** Whether a binary message is an audio block; a newer server may send other kinds. */
 export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer).getUint8(0) === AUDIO_BLOCK;
 
+function parseHeader(view) {
+  if (view.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) throw new TypeError("not an audio block");
+  return {
+    flags: view.getUint8(1),
+    sequence: view.getUint32(4, true),
+    sampleClock: Number(view.getBigUint64(8, true)),
+    poseId: view.getUint32(16, true),
+    reverberationPoseId: view.getUint32(20, true),
+    frames: view.getUint32(24, true),
+  };
+}
+
 /**
  * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, channels}. `channels` are Float32Array(frames):
  * both ears, equal if the block has one channel, or 4, 9 or 16 of ambisonics. The poses are the newest of the direct sound and of the
@@ -53,11 +66,9 @@ export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer)
  */
 export function parseBlock(buffer, encoding = "f32") {
   const view = new DataView(buffer);
-  if (buffer.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) {
-    throw new TypeError("not an audio block");
-  }
+  const header = parseHeader(view);
+  const { frames } = header;
   const count = view.getUint16(2, true);
-  const frames = view.getUint32(24, true);
   const bytes = encoding === "s16" ? 2 : 4;
   if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * bytes) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${count} channels`);
@@ -69,21 +80,28 @@ export function parseBlock(buffer, encoding = "f32") {
       samples[frame] = bytes === 2 ? view.getInt16(at, true) / FULL_SCALE : view.getFloat32(at, true);
     }
   });
-  return {
-    flags: view.getUint8(1),
-    sequence: view.getUint32(4, true),
-    sampleClock: Number(view.getBigUint64(8, true)),
-    poseId: view.getUint32(16, true),
-    reverberationPoseId: view.getUint32(20, true),
-    frames,
-    channels,
-  };
+  return { ...header, channels };
+}
+
+/** An audio block in Opus: its header as above, without channels, and its packets, each a Uint8Array. */
+export function parsePackets(buffer) {
+  const view = new DataView(buffer);
+  const header = parseHeader(view);
+  const packets = [];
+  for (let at = BLOCK_HEADER_BYTES; at < buffer.byteLength; ) {
+    const length = at + 2 <= buffer.byteLength ? view.getUint16(at, true) : 0;
+    at += 2;
+    if (length === 0 || at + length > buffer.byteLength) throw new TypeError(`packet ${packets.length} of an audio block is incomplete`);
+    packets.push(new Uint8Array(buffer, at, length));
+    at += length;
+  }
+  return { header, packets };
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, encoding = "f32", level, effects, output, order, head, bufferBlocks, listener, emitters }) =>
+  hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters }) =>
     JSON.stringify({
-      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, level, effects, output, order, hrtf: head,
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
       buffer_blocks: bufferBlocks, listener, emitters,
     }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
