@@ -30,7 +30,7 @@ from functools import partial
 from typing import Final
 
 from starlette.responses import Response
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
@@ -400,7 +400,7 @@ class Connection:
             _logger.info("stream ended", extra={"session": self._session, **reason, **self._figures})
 
     async def _say(self, goodbye: Goodbye) -> None:
-        with contextlib.suppress(TimeoutError):
+        with contextlib.suppress(TimeoutError, WebSocketDisconnected):  # a client that has gone is told nothing
             async with asyncio.timeout(_GOODBYE_S):
                 await self._send_message(goodbye.error)
                 await self._websocket.close(goodbye.close_code, goodbye.error.code)

@@ -463,6 +463,11 @@ class Page {
       if (this.output === "ambisonics") this.head = head;
     } catch (error) {
       if (this.output !== "ambisonics") return; // it is tried again when it is needed
+      if ([0, 503].includes(error.status)) { // the server cannot be reached, or is about to end or to begin
+        await pause(RETRY_MS);
+        if (this.output === "ambisonics") this.#listenWithHead();
+        return;
+      }
       this.notices.show(error.code ?? "decoder", `The sound is turned on the server: ${error.message}`);
       this.turning.giveUp();
       this.#renewed();

@@ -1,5 +1,6 @@
-// A live stream that reconnects by itself. It keeps the wanted state (poses, emitters) and sends it to the server at first and after
-// every reconnect. It runs in a worker, so that drawing never delays audio. Times are epoch milliseconds.
+// A live stream that reconnects by itself. A server that has kept the stream goes on with it, and is sent what it had not got yet. Else the
+// stream begins anew with the wanted state (poses, emitters). It runs in a worker, so that drawing never delays audio. Times are epoch
+// milliseconds.
 
 import { authorized } from "./http.js";
 import { OpusReader } from "./opus.js";
@@ -14,6 +15,11 @@ const REST_MS = 1000; // the pose of a listener at rest is sent again this often
 const SILENCE_MS = 4000; // a server that sends audio is never silent for this long
 const REFUSED = 1008; // the hello was refused, so a new connection would not help
 const ACCESS_ENDED = 4401; // the key or token has expired or was revoked
+const TAKEN_OVER = 4409; // another connection has resumed the stream
+const ENDED = 1000; // for good
+const LOST = 4000; // a connection that is given up, whose stream is to be kept
+const FORGOTTEN = "unknown_resume_token";
+const MOST_ORDERS = 256;
 const NEEDS_KEY = 401;
 const BUSY = 503;
 
@@ -45,6 +51,12 @@ export class Stream {
   #asking = 0; // timer that asks for them again
   #encoding = "f32";
   #opus = null; // the reader of blocks in Opus
+  #token = null; // resumes the stream
+  #resumeMs = 0; // for so long after the connection was lost
+  #lostAt = null; // when the connection of a stream to be resumed was lost
+  #last = {}; // {sequence, sampleClock} of the last block
+  #orders = []; // the newest messages that the server counts, and how many there were
+  #ordered = 0;
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
@@ -77,13 +89,13 @@ export class Stream {
     const { id, clip, gainDb } = emitter;
     const known = this.#emitters.get(id);
     this.#emitters.set(id, emitter);
-    if (!this.#welcomed) return;
+    if (!this.#isOpen) return;
     if (!known || known.clip !== clip) {
-      if (known) this.#send(message.removeEmitter(id));
+      if (known) this.#order(message.removeEmitter(id));
       this.#dry.delete(id);
       this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
-      this.#send(message.setGain(emitter));
+      this.#order(message.setGain(emitter));
     } else {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();
@@ -103,12 +115,12 @@ export class Stream {
     this.#dry.delete(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
-    if (this.#welcomed) this.#send(message.removeEmitter(id));
+    if (this.#isOpen) this.#order(message.removeEmitter(id));
   }
 
   setLevel(level) {
     this.#hello = { ...this.#hello, level };
-    if (this.#welcomed) this.#send(message.setLevel(level));
+    if (this.#isOpen) this.#order(message.setLevel(level));
   }
 
   /** Each of `effects` is on, off, or null to follow the plan; `output` is null to keep the present one. */
@@ -116,14 +128,15 @@ export class Stream {
     const wished = { ...this.#hello.effects, ...effects };
     for (const [name, isOn] of Object.entries(wished)) if (isOn === null) delete wished[name];
     this.#hello = { ...this.#hello, effects: wished, output: output ?? this.#hello.output };
-    if (this.#welcomed) this.#send(message.setEffects({ effects, output }));
+    if (this.#isOpen) this.#order(message.setEffects({ effects, output }));
   }
 
   /** Begins a new stream, since only a hello says what `changes` say: the head, or the channels of the output. */
   renew(changes) {
     this.#hello = { ...this.#hello, ...changes };
     clearTimeout(this.#retry);
-    this.#detach();
+    this.#detach(ENDED);
+    this.#forget();
     this.#attempt = 0;
     this.#connect();
   }
@@ -131,23 +144,46 @@ export class Stream {
   close() {
     clearTimeout(this.#retry);
     clearTimeout(this.#sending);
-    this.#detach();
+    this.#detach(ENDED);
+    this.#forget();
     this.#listeners.state({ state: "closed" });
   }
 
   #add(emitter) {
     this.#missing.add(emitter.id);
-    this.#send(message.addEmitter(emitter));
+    this.#order(message.addEmitter(emitter));
   }
 
   #askAgain() {
-    for (const id of this.#missing) this.#send(message.addEmitter(this.#emitters.get(id)));
+    for (const id of this.#missing) this.#order(message.addEmitter(this.#emitters.get(id)));
   }
 
-  #detach() {
-    clearTimeout(this.#asking);
+  /** Whether there is a stream that messages are for: one with a connection, or one to be resumed. */
+  get #isOpen() {
+    return this.#welcomed || this.#token !== null;
+  }
+
+  /** Sends a message that changes the stream, now or when it is resumed. */
+  #order(text) {
+    this.#orders.push(text);
+    this.#ordered += 1;
+    if (this.#orders.length > MOST_ORDERS) this.#orders.shift();
+    if (this.#welcomed) this.#send(text);
+  }
+
+  /** Begins anew with the next connection. */
+  #forget() {
+    this.#token = this.#lostAt = null;
+    this.#last = {};
+    this.#orders = [];
+    this.#ordered = 0;
     this.#missing.clear();
     this.#dry.clear();
+  }
+
+  /** Leaves the connection with a close code. */
+  #detach(code) {
+    clearTimeout(this.#asking);
     this.#opus?.close();
     this.#opus = null;
     clearInterval(this.#watchdog);
@@ -157,7 +193,7 @@ export class Stream {
     this.#welcomed = false;
     if (!socket) return;
     socket.onopen = socket.onmessage = socket.onclose = null;
-    socket.close(1000);
+    socket.close(code);
   }
 
   #connect() {
@@ -165,6 +201,11 @@ export class Stream {
     const socket = new WebSocket(this.#url, protocolsFor(this.#key));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
+      if (this.#token !== null && now() - this.#lostAt > this.#resumeMs) this.#forget();
+      if (this.#token !== null) {
+        socket.send(message.resume({ token: this.#token, ...this.#last }));
+        return;
+      }
       const { at, ...listener } = this.#listener;
       socket.send(message.hello({ ...this.#hello, listener, emitters: this.#emitters.size }));
       this.#poseId = 0; // the hello's listener is pose 0
@@ -189,7 +230,7 @@ export class Stream {
     const problem = answer?.status === NEEDS_KEY ? await answer.json().catch(() => ({})) : null;
     if (this.#socket !== socket) return; // closed or renewed meanwhile
     if (problem) {
-      this.#detach();
+      this.#detach(ENDED);
       this.#listeners.state({ state: "refused", reason: problem.detail, needsKey: true });
       return;
     }
@@ -198,8 +239,17 @@ export class Stream {
   }
 
   #lost(code, reason) {
-    this.#detach();
-    if (code === REFUSED || code === ACCESS_ENDED) {
+    const wasHeard = this.#welcomed;
+    this.#detach(LOST);
+    if (wasHeard) this.#lostAt = now();
+    if (code === REFUSED && this.#lastError === FORGOTTEN) {
+      this.#forget();
+      this.#lastError = null;
+      this.#connect();
+      return;
+    }
+    if ([REFUSED, ACCESS_ENDED, TAKEN_OVER].includes(code)) {
+      this.#forget();
       const told = this.#lastError ?? (reason || "The server refused the stream.");
       this.#listeners.state({ state: "refused", reason: told, needsKey: code === ACCESS_ENDED });
       return;
@@ -220,7 +270,8 @@ export class Stream {
     else if (received.type === "plan_changed") this.#listeners.effects(received);
     else if (received.type === "emitter_added") this.#added(received.id);
     else if (received.type === "error") {
-      this.#lastError = received.message;
+      this.#lastError = received.code === FORGOTTEN ? FORGOTTEN : received.message;
+      if (received.code === FORGOTTEN) return; // the stream begins anew
       const comeBackMs = received.retry_after_s ? 1000 * received.retry_after_s : null;
       if (!this.#welcomed) {
         this.#comeBackMs = comeBackMs;
@@ -249,8 +300,12 @@ export class Stream {
     this.#attempt = 0;
     this.#lastError = null;
     this.#dirty.clear();
+    this.#token = welcome.resume_token ?? null;
+    this.#resumeMs = 1000 * (welcome.resume_s ?? 0);
+    this.#lostAt = null;
     this.#listeners.state({ state: "live", welcome });
-    for (const emitter of this.#emitters.values()) this.#add(emitter);
+    if (welcome.resumed) this.#goOn(welcome.resumed);
+    else for (const emitter of this.#emitters.values()) this.#add(emitter);
     // Everything that moved between hello and welcome is in here.
     this.setListener({ ...this.#listener, at: now() });
     clearInterval(this.#heartbeat);
@@ -259,10 +314,18 @@ export class Stream {
     }, REST_MS);
   }
 
+  /** Sends what the server had not got when the connection was lost, and where everything is now. */
+  #goOn({ handled }) {
+    const lost = Math.max(0, this.#ordered - handled);
+    for (const text of this.#orders.slice(Math.max(0, this.#orders.length - lost))) this.#send(text);
+    for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
+  }
+
   #receiveBlock(buffer) {
     this.#heardAt = now();
     if (!isBlock(buffer)) return; // a newer server may send other kinds
     const { header: block, packets } = this.#opus ? parsePackets(buffer) : { header: parseBlock(buffer, this.#encoding), packets: null };
+    this.#last = { sequence: block.sequence, sampleClock: block.sampleClock };
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
     const told = { ...block, late: (block.flags & FLAG_LATE) !== 0 };
     if (packets) this.#opus.read(told, packets, (block.flags & FLAG_RESTART) !== 0);

@@ -18,8 +18,8 @@ function open({ url, key, hello, listener, emitters, port }) {
     listeners: {
       block: (block) => playerPort.postMessage(block, block.channels.map((samples) => samples.buffer)),
       state(detail) {
-        // A new stream counts its samples and poses from zero.
-        if (detail.state === "live") playerPort.postMessage({ restart: true, order: detail.welcome.order ?? null });
+        // A new stream counts its samples and poses from zero. One that goes on does not.
+        if (detail.state === "live" && !detail.welcome.resumed) playerPort.postMessage({ restart: true, order: detail.welcome.order ?? null });
         self.postMessage({ type: "state", detail });
       },
       posed: tell("posed"),

@@ -104,6 +104,8 @@ export const message = {
       type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
       buffer_blocks: bufferBlocks, listener, emitters,
     }),
+  resume: ({ token, sequence, sampleClock }) =>
+    JSON.stringify({ type: "resume", protocol: PROTOCOL, token, sequence, sample_clock: sampleClock }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
   addEmitter: ({ id, clip, live, loop, position, orientation, directivity, gainDb }) =>
