@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import re
+import time
 
 import numpy as np
 import pytest
@@ -321,9 +322,19 @@ async def proxy(target):
         await asyncio.sleep(0.05)
 
 
-def test_a_lost_connection_is_made_anew_with_the_emitters_the_level_and_the_pose(served):
+@pytest.fixture(scope="module")
+def served_without_resume(bundle, hrtfs):
+    """A server that keeps no stream whose connection was lost."""
+    with contextlib.ExitStack() as opened:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("NAFIR_RESUME_S", "0")
+            address = opened.enter_context(serving(FieldsByLevel.load(bundle), hrtfs))
+        yield address
+
+
+def test_a_lost_connection_is_made_anew_with_the_emitters_the_level_and_the_pose(served_without_resume):
     async def listen():
-        async with proxy(served) as way, connect(way.address, reconnect=SOON) as stream:
+        async with proxy(served_without_resume) as way, connect(way.address, reconnect=SOON) as stream:
             clip = await stream.add_emitter(clip="woman-reading")
             live = await stream.add_emitter(id="voice")
             await clip.move((3.0, 2.0, 1.5))
@@ -350,6 +361,37 @@ def test_a_lost_connection_is_made_anew_with_the_emitters_the_level_and_the_pose
     assert loudness(after[-40:]) > 1e-3
 
 
+def test_a_stream_is_resumed_on_its_clock_and_nothing_said_meanwhile_is_lost(served):
+    async def listen():
+        async with proxy(served) as way, connect(way.address, reconnect=SOON) as stream:
+            clip = await stream.add_emitter(clip="woman-reading", id="clip")
+            before = await blocks_of(stream, 40)
+            session, begun_s = stream.welcome.given["session"], time.monotonic()
+            way.is_open = False
+            way.cut()
+            # Said while nobody listens: a pose, a gain, another emitter.
+            moved = await clip.move((3.0, 2.0, 1.5))
+            await clip.set_gain(6.0)
+            adding = asyncio.create_task(stream.add_emitter(clip="trumpet", id="other"))
+            asyncio.get_running_loop().call_later(0.3, setattr, way, "is_open", True)
+            after = await blocks_of(stream, 1)
+            away_s = after[0].arrived_s - begun_s
+            other = await adding
+            async for block in stream:
+                after.append(block)
+                if block.reverberation_pose_id >= moved and len(after) > 60:
+                    break
+            assert stream.welcome.given["session"] == session
+            return before, after, away_s, other, stream.statistics
+
+    before, after, away_s, other, counts = running(listen())
+    assert (counts.reconnections, other.id) == (1, "other")
+    assert [block.sequence for block in after] == list(range(before[-1].sequence + 1, after[-1].sequence + 1))
+    gap_s = (after[0].sample_clock - before[-1].sample_clock) / 24_000
+    assert 0 < gap_s < away_s + 0.5
+    assert loudness(after[-30:]) > 1e-3
+
+
 def test_a_connection_over_which_nothing_comes_is_noticed_and_made_anew(served, monkeypatch):
     monkeypatch.setattr("nafir_client.stream._SILENCE_S", 1.0)
 
@@ -362,6 +404,7 @@ def test_a_connection_over_which_nothing_comes_is_noticed_and_made_anew(served, 
             return before, after
 
     before, after = running(listen())
+    assert after[0].sequence > before[-1].sequence
     assert after[0].sample_clock > before[-1].sample_clock
 
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from nafir_client import ClosedError, MissingExtraError, RefusedError, UnreachableError, threaded
+from nafir_client import ClosedError, MissingExtraError, Pose, RefusedError, UnreachableError, threaded
 from nafir_client.playback import Player
 from server.field.fields_by_level import FieldsByLevel
 from tests.directional_flat import write_directional
@@ -38,6 +38,22 @@ def test_a_clip_is_heard_through_the_buffer(served):
     assert heard.shape[1] == 2
     assert np.sqrt(np.mean(heard[-12_000:] ** 2)) > 1e-3
     assert len(counts.pose_to_sound.durations) >= 1
+
+
+def test_all_that_a_server_sends_ahead_has_room(served):
+    with connect(served, buffer_blocks=32, block_size=1_024) as stream:
+        played(stream, 0.5)
+        assert stream.delay_s > 0.5
+        assert stream.statistics.underruns == 0
+
+
+def test_a_listener_begins_where_the_stream_says(served):
+    with connect(served, listener=Pose.of((3.0, 3.0, 1.5), yaw=1.0)) as stream:
+        assert stream.listener.position == (3.0, 3.0, 1.5)
+        stream.move_listener((3.5, 3.0, 1.5)).result(5)
+        assert stream.listener.position == (3.5, 3.0, 1.5)
+    with connect(served) as stream:
+        assert stream.listener == Pose.of((2.0, 2.5, 1.5), yaw=np.pi / 2)
 
 
 def test_reading_never_waits_and_is_silent_without_a_stream(served):

@@ -229,6 +229,12 @@ class Stream:
         return self.welcome.channels
 
     @property
+    def listener(self) -> Pose:
+        """The newest pose of the listener."""
+        start = self.scene.listener
+        return self._session.listener or Pose.of(start.position, yaw=start.yaw)
+
+    @property
     def level(self) -> str:
         """The present quality level."""
         return self._session.level

@@ -23,7 +23,7 @@ from nafir_client.backoff import Backoff
 from nafir_client.client import Client
 from nafir_client.errors import ClosedError, NafirClientError
 from nafir_client.jitter_buffer import JitterBuffer
-from nafir_client.pose import FORWARD, Orientation, Pose, yawed
+from nafir_client.pose import FORWARD, Orientation, Pose
 from nafir_client.scene import Scene, Welcome
 from nafir_client.session import EmitterOptions, Message, StreamOptions
 from nafir_client.stream_statistics import StreamStatistics
@@ -31,6 +31,7 @@ from nafir_client.wire import Block, Samples
 
 T = TypeVar("T")
 _OPEN_S = 60.0
+_LONGEST_S = 0.5
 _CALL_S = 15.0
 """How long calls that wait for the server may take."""
 
@@ -193,6 +194,11 @@ class ThreadedStream:
         return self._stream.channels if self._ears is None else 2
 
     @property
+    def listener(self) -> Pose:
+        """The newest pose of the listener."""
+        return self._stream.listener
+
+    @property
     def level(self) -> str:
         return self._stream.level
 
@@ -294,8 +300,14 @@ class ThreadedStream:
             self._ears = Ears(
                 self._client.head_filters(self._head, order=welcome.order, sample_rate=welcome.sample_rate)
             )
-        self._orientation = yawed(welcome.scene.listener.yaw)
-        self._buffer = JitterBuffer(welcome.sample_rate, welcome.channels, output_rate=self._output_rate)
+        self._orientation = self._stream.listener.orientation
+        ahead_s = welcome.buffer_blocks * welcome.block_size / welcome.sample_rate
+        self._buffer = JitterBuffer(
+            welcome.sample_rate,
+            welcome.channels,
+            output_rate=self._output_rate,
+            longest_s=max(_LONGEST_S, 2 * ahead_s),  # what the server sends ahead has room
+        )
 
     async def _receive(self) -> None:
         assert self._buffer is not None
