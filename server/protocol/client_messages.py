@@ -375,7 +375,7 @@ _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(dis
 
 def emitter_of(message: ClientMessage) -> str | None:
     """The id of the emitter that a message is about; None if it is about none."""
-    about_one = AddEmitter | MoveEmitter | StopEmitter | SetGain | RemoveEmitter | DryBlock
+    about_one = AddEmitter | MoveEmitter | StopEmitter | SetGain | RemoveEmitter | DryBlock | DryPackets
     return message.id if isinstance(message, about_one) else None
 
 
