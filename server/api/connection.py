@@ -32,9 +32,10 @@ from typing import Final
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
+from server.acoustics.spherical_harmonics import harmonic_count
 from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
-from server.api.block_encoding import BlockEncoding
+from server.api.block_encoding import CHANNEL_SHARE, BlockEncoding
 from server.api.catalogue import describe_scene
 from server.api.inflow import Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
@@ -263,7 +264,12 @@ class StreamHost:
         costs = self.render_costs.get((hello.scene, levels.default.sample_rate))
         if costs is None:
             return None
-        return kind_of(levels, costs, block_size=hello.block_size, order=hello.ambisonic_order)
+        order = hello.ambisonic_order
+        kind = kind_of(levels, costs, block_size=hello.block_size, order=order)
+        if is_of_samples(hello.encoding):
+            return kind
+        channels = (1 if hello.output == "mono" else 2) if order is None else harmonic_count(order)
+        return dataclasses.replace(kind, encoding=CHANNEL_SHARE * channels)
 
     def turn_away(self) -> Response | None:
         """The answer to whoever asks for a stream while not even the cheapest has room; None if one has, or if it may
@@ -550,9 +556,10 @@ class Connection:
             self._block_encoding = BlockEncoding(
                 encoder,
                 self._host.encoders,
+                block_s=hello.block_size / field.sample_rate,
                 capacity=self._capacity,
                 post=asyncio.get_running_loop().call_soon_threadsafe,
-                deliver=self._send_or_queue,
+                deliver=self._send_encoded,
             )
         self._live_decoders = LiveDecoders(field.sample_rate, settings.max_emitters)
         self._session = uuid.uuid4().hex if lost is None else lost.snapshot.session
@@ -841,6 +848,11 @@ class Connection:
             self._send_or_queue(outgoing)
         elif not self._block_encoding.put(outgoing):
             self._end(_TOO_SLOW)
+
+    def _send_encoded(self, outgoing: list[Outgoing]) -> None:
+        if self._stream is not None and self._block_encoding is not None:
+            self._stream.encoding_load = self._block_encoding.load
+        self._send_or_queue(outgoing)
 
     def _send_or_queue(self, outgoing: list[Outgoing]) -> None:
         """Send output: blocks at once if there is a fast path and nothing waits to be sent."""

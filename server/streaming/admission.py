@@ -364,6 +364,7 @@ class Admission:
         cost = StreamCost(
             rendering=max(0.0, base.rendering + new.rendering - less.rendering),
             loop=present.loop,
+            encoding=present.encoding,
             request_s=max(0.0, base.request_s + new.request_s - less.request_s),
             rate_hz=new.rate_hz,
             patience_s=new.patience_s,
@@ -434,6 +435,7 @@ class Admission:
         cost = StreamCost(
             rendering=shown.rendering,
             loop=self._block_sent_s / stream.block_s,
+            encoding=stream.encoding_load,
             request_s=stream.request_s if shown.responses > 0 else 0.0,
             rate_hz=shown.responses / stream.request_s if stream.request_s else 0.0,
             patience_s=patience_s(self._thresholds, stream.ladder.step) if shown.responses > 0 else math.inf,
@@ -448,6 +450,7 @@ class Admission:
         return replace(
             cost,
             rendering=max(cost.rendering, expected.rendering),
+            encoding=max(cost.encoding, expected.encoding),
             request_s=max(cost.request_s, expected.request_s),
             rate_hz=max(cost.rate_hz, expected.rate_hz),
             patience_s=expected.patience_s,

@@ -106,12 +106,13 @@ class RenderCost:
 class StreamKind:
     """What streams of one scene, sample rate, block length and output cost on this host. `render` has the costs of each
     quality level, and `walk` the mean cost of an IR on a walk as a share of that of one for which no other can be
-    reused; `key` identifies the kind."""
+    reused; `key` identifies the kind. `encoding` is the share of a core that the encoder of such a stream takes."""
 
     key: tuple[str, int, int, int | None]
     block_s: float
     render: Mapping[str, RenderCost]
     walk: Mapping[str, float] = field(default_factory=dict)
+    encoding: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -126,11 +127,12 @@ class Correction:
 class StreamCost:
     """What a stream takes: `rendering` as a share of a core at one block at once, `loop` as a share of the event loop,
     and `rate_hz` requests for IRs per second of `request_s` CPU seconds each, for which it waits `patience_s`.
-    `opening_s` is the CPU time of its first IRs. A stream that `is_top` is on top of its ladder; one that `is_live`
-    gets one block at a time."""
+    `opening_s` is the CPU time of its first IRs. `encoding` is the share of a core that its encoder takes. A stream
+    that `is_top` is on top of its ladder; one that `is_live` gets one block at a time."""
 
     rendering: float
     loop: float = 0.0
+    encoding: float = 0.0
     request_s: float = 0.0
     rate_hz: float = 0.0
     patience_s: float = math.inf
@@ -164,6 +166,7 @@ def expected_cost(
     return StreamCost(
         rendering=share * correction.rendering,
         loop=(limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
+        encoding=kind.encoding,
         request_s=request_s,
         rate_hz=rate_hz,
         patience_s=patience_s(thresholds, step),
@@ -196,12 +199,13 @@ class ServerLoad:
     """What all streams take. Of those on top of their ladders, `demand` is the share of a core for all their requests
     for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
     below, `eased_demand` is the share of a core. `opening_s` is the CPU time of first IRs that are still to be
-    computed."""
+    computed. `encoding` is the share of a core of all encoders."""
 
     threads: tuple[ThreadLoad, ...]
     cores: int
     workers: int
     loop: float = 0.0
+    encoding: float = 0.0
     demand: float = 0.0
     round_s: float = 0.0
     patience_s: float = math.inf
@@ -231,6 +235,7 @@ class ServerLoad:
             self,
             threads=(*self.threads[:number], thread, *self.threads[number + 1 :]),
             loop=max(0.0, self.loop + sign * cost.loop),
+            encoding=max(0.0, self.encoding + sign * cost.encoding),
             demand=max(0.0, self.demand + sign * top),
             round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
             eased_demand=max(0.0, self.eased_demand + sign * eased),
@@ -257,9 +262,9 @@ def blocks_needed(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) ->
 
 
 def spare_cores(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
-    """Return the cores that audio threads, the event loop and plans of effects leave to everything else."""
+    """Return the cores that audio threads, encoders, the event loop and plans of effects leave to everything else."""
     threads = sum(_settled(limits, thresholds, thread) for thread in load.threads)
-    return max(0.0, load.cores - threads - load.loop - _plans(thresholds, load))
+    return max(0.0, load.cores - threads - load.encoding - load.loop - _plans(thresholds, load))
 
 
 def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
@@ -331,8 +336,9 @@ def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> floa
 
 def _spare_when_full(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
     """Return the cores that are left when the audio threads render as much as they may."""
-    rendering = min(limits.full_rendering * len(load.threads), limits.full_cores * load.cores - load.loop)
-    return max(0.0, load.cores - rendering - load.loop - _plans(thresholds, load))
+    others = load.encoding + load.loop
+    rendering = min(limits.full_rendering * len(load.threads), limits.full_cores * load.cores - others)
+    return max(0.0, load.cores - rendering - others - _plans(thresholds, load))
 
 
 def _plans(thresholds: Thresholds, load: ServerLoad) -> float:
@@ -357,12 +363,12 @@ def _waits_are_short(limits: Limits, thresholds: Thresholds, load: ServerLoad, s
 
 
 def _cores_needed(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
-    """Return the cores that may not be missing: for blocks at the most at once, the event loop and the least share for
-    IRs of each thread with streams."""
+    """Return the cores that may not be missing: for blocks at the most at once, encoders, the event loop and the least
+    share for IRs of each thread with streams."""
     most = thresholds.blocks_at_once[-1]
     least = thresholds.ir_share * thresholds.least_ir_share * sum(thread.streams > 0 for thread in load.threads)
     threads = sum(busy(limits, thread, most) for thread in load.threads)
-    return threads + load.loop + min(least, load.demand + load.eased_demand)
+    return threads + load.encoding + load.loop + min(least, load.demand + load.eased_demand)
 
 
 def freest_thread(limits: Limits, load: ServerLoad) -> int:

@@ -133,6 +133,8 @@ class Stream:
         self.regrets = RegretRecord()
         self.load = 0.0
         """Smoothed share of a core that its blocks take."""
+        self.encoding_load = 0.0
+        """Share of a core that encoding its blocks takes, on a thread of its own; the sender writes it."""
         self.expected_load = 0.0
         """Share of a core that its blocks are expected to take until they have shown what they take."""
         self.next_block = 0

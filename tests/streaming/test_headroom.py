@@ -58,6 +58,7 @@ def test_more_blocks_at_once_make_room_but_not_for_live_samples():
         (replace(crowd(2), loop=0.69), StreamCost(0.0, loop=0.02), "event_loop"),
         (replace(crowd(2), cores=1, loop=0.6), StreamCost(0.4, request_s=0.001, rate_hz=5.0), "cores"),
         (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=30.0, patience_s=0.15, is_top=True), "responses"),
+        (replace(crowd(2), encoding=1.5), StreamCost(0.1, encoding=0.3), "cores"),
         (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=2.0), "responses"),
         (crowd(2), StreamCost(0.1, request_s=0.001, rate_hz=2.0, opening_s=0.2), "opening"),
     ],
