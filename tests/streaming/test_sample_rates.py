@@ -43,14 +43,14 @@ def places(field):
     return (start.listener, (x, y + 0.5, z)), start.emitter
 
 
-def heard(field, rate, clip=None, *, is_planned=False, **hello):
-    """(channel, n): at rest for half of the time, and in the other half half a metre away."""
+def heard(field, rate, clip=None, *, seconds=SECONDS, stops=2, is_planned=False, **hello):
+    """(channel, n): at rest for half of the time, and in the other half half a metre away; or in one place."""
     levels, place = FieldsByLevel([field]), None
     if is_planned:
         known = place_of_field(field).reverberations
         place = place_of(field.bundle, known, block_size=BLOCKS[rate], sample_rate=rate)
-    stops, emitter = places(field)
-    first = ListenerStart(position=stops[0], yaw=0.5)
+    here, emitter = places(field)
+    first = ListenerStart(position=here[0], yaw=0.5)
     asked = {"scene": field.bundle.id, "sample_rate": rate, "block_size": BLOCKS[rate], "listener": first, **hello}
     session = Session(
         Hello(protocol=PROTOCOL, **asked),
@@ -64,10 +64,10 @@ def heard(field, rate, clip=None, *, is_planned=False, **hello):
     )
     session.receive(AddEmitter(id="talker", clip="noise", position=emitter, loop=False))
     blocks = []
-    for number, place in enumerate(stops, start=1):
+    for number, place in enumerate(here[:stops], start=1):
         if number > 1:
             session.receive(ListenerPose(pose_id=number, position=place, yaw=0.5 * number))
-        for _ in range(round(SECONDS / 2 * rate / BLOCKS[rate])):
+        for _ in range(round(seconds / stops * rate / BLOCKS[rate])):
             if (plan := session.take_plan_request()) is not None:
                 session.adopt(plan.plan())
             if (request := session.take_request()) is not None:
@@ -104,6 +104,26 @@ def test_reflected_sound_is_that_of_the_scenes_own_rate(bundle, rate):
     assert at_rest_db > (80 if rate == 44_100 else 120)
     if rate != 44_100:
         assert signal_to_noise_db(other, rate, own) > 70
+
+
+@RATES
+@pytest.mark.parametrize("tone_hz", [440.0, 9_431.7])
+def test_a_tone_stays_that_tone_and_nothing_else_appears(mirrored_field, rate, tone_hz):
+    """Through the resampled response, the first reflections and the direct sound at once."""
+    seconds, settled = 1.6, slice(round(0.6 * rate), round(1.5 * rate))
+    phase = 2 * np.pi * tone_hz * np.arange(round(2 * rate)) / rate
+    clip = (0.01 * np.sin(phase)).astype(np.float32)
+    stayed = heard(mirrored_field, rate, clip, seconds=seconds, stops=1)[0][settled]
+    window = np.kaiser(stayed.size, 20)
+    spectrum = np.abs(np.fft.rfft(stayed * window, 4 * stayed.size))
+    hz = np.fft.rfftfreq(4 * stayed.size, 1 / rate)
+    elsewhere = np.abs(hz - tone_hz) > 12
+    assert 20 * np.log10(spectrum[elsewhere].max() / spectrum.max()) < -100
+    # Its phase turns with the clip's: a drift of a milliradian a second would be a ten-millionth of its frequency.
+    first, last = np.array_split(stayed * np.exp(-1j * phase[settled]), 2)
+    window = np.kaiser(first.size, 20)
+    turned = np.angle(np.sum(last[: first.size] * window) / np.sum(first * window))
+    assert abs(turned) < 1e-3
 
 
 @pytest.fixture(scope="module")
