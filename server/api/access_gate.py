@@ -51,7 +51,7 @@ RULES: Final = (
     _rule(r"/v1/scenes/[^/]+/bundle/[^/]+", "render", methods=_READ),
     _rule(r"/v1/clips(/.*)?", "listen", "upload", methods=_READ),
     _rule(r"/v1/clips(/.*)?", "upload"),
-    _rule(r"/v1/hrtfs(/.*)?", "listen", "render", methods=_READ),
+    _rule(r"/v1/(encodings|hrtfs)(/.*)?", "listen", "render", methods=_READ),
     _rule(r"/v1/stream(/.*)?", "listen"),
     _rule(r"/(openapi|asyncapi)\.json|/docs(/.*)?|/redoc(/.*)?|/v1/schemas(/.*)?", *SCOPES, methods=_READ),
 )

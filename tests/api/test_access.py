@@ -76,7 +76,8 @@ def paths(app):
     for context in iter_route_contexts(app.router.routes):
         path = getattr(context, "path", None)
         if path:
-            filled = path.replace("{scene}", "flat").replace("{hrtf}", "kemar").replace("{path:path}", "")
+            filled = path.replace("{scene}", "flat").replace("{hrtf}", "kemar").replace("{file}", "scene.json")
+            filled = filled.replace("{path:path}", "")
             yield filled, frozenset(getattr(context, "methods", None) or ())
 
 
@@ -123,6 +124,14 @@ def test_an_outsider_gets_nothing_but_health_and_the_page(client):
         if file.is_file():
             assert client.get(f"/{file.relative_to(WEB).as_posix().removesuffix('.gz')}").status_code == 200
     assert client.get("/").status_code == 200
+
+
+def test_no_route_of_version_1_is_closed_to_all_but_operators_by_oversight(client):
+    found = [(path, methods or {"GET"}) for path, methods in paths(client.app) if path.startswith("/v1/")]
+    assert len(found) > 8
+    for path, methods in found:
+        for method in methods - {"HEAD", "OPTIONS"}:
+            assert scopes_for(method, path) != {"admin"}, (method, path)
 
 
 def test_a_key_in_the_query_opens_nothing(client, keys):

@@ -136,11 +136,11 @@ def test_output_of_another_shape_is_a_bundle_error(bundle, tmp_path, output, sha
 
 def test_output_of_another_kind_is_a_bundle_error(bundle, tmp_path):
     model = onnx.load_from_string(bundle.models["arithmetic.onnx"])
-    model.graph.node.append(helper.make_node("SequenceConstruct", ["level"], ["log_magnitudes"]))
+    model.graph.node.append(helper.make_node("Cast", ["plain"], ["log_magnitudes"], to=TensorProto.DOUBLE))
     (entry,) = (entry for entry in model.graph.output if entry.name == "log_magnitude")
     for node in model.graph.node:
         node.output[:] = [{"log_magnitude": "plain", "log_magnitudes": "log_magnitude"}.get(o, o) for o in node.output]
-    entry.CopyFrom(helper.make_tensor_sequence_value_info("log_magnitude", TensorProto.FLOAT, None))
+    entry.type.tensor_type.elem_type = TensorProto.DOUBLE
     with pytest.raises(BundleError, match=r"arithmetic\.onnx: outputs"):
         AcousticField.load(_with_graph(bundle, tmp_path, model))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from server.core.errors import BundleError, RequestError
-from server.field.external_data import refers_to_other_files
+from server.field.graph_file import GraphFile
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import parse_client_message
 from server.scene.bundle import BUNDLED, MANIFEST_FILE, Bundle
@@ -62,10 +62,10 @@ def load(folder: Path) -> Bundle | None:
     return None
 
 
-def look_for_other_files(model: bytes) -> bool | None:
-    """Whether a graph keeps weights in other files; None for what is no protobuf."""
+def look_into_a_graph(model: bytes) -> GraphFile | None:
+    """What a graph says of itself; None for what is no protobuf, or too large."""
     try:
-        return refers_to_other_files(model)
+        return GraphFile.read(model)
     except ValueError as exc:
         refusal = exc
     assert str(refusal)

@@ -16,7 +16,7 @@ import atheris
 
 with atheris.instrument_imports(include=["server"]):
     from server.core import npy  # noqa: F401
-    from server.field import external_data  # noqa: F401
+    from server.field import graph_file  # noqa: F401
     from server.protocol import blocks, client_messages  # noqa: F401  what is instrumented is what is imported here
     from server.scene import bundle, geometry, manifest  # noqa: F401
 
@@ -24,7 +24,7 @@ from doors import (  # beside this script
     BLOCKS,
     MESSAGES,
     load,
-    look_for_other_files,
+    look_into_a_graph,
     receive,
     write_arrays,
     write_bundle_without_fields,
@@ -55,7 +55,7 @@ def bundles(folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
         kind, content = data[:1], data[1:]
         write_manifest(written, whole)
         if kind == b"g":
-            look_for_other_files(content)
+            look_into_a_graph(content)
         elif kind == b"n":
             packed = io.BytesIO()
             with zipfile.ZipFile(packed, "w") as archive:
