@@ -61,8 +61,8 @@ def _operation(name: str, operation: Mapping[str, Any], always: set[str]) -> str
             default = "required"
         kind = _PATTERNED.get(parameter["name"]) or type_name(schema)
         rows.append((code(parameter["name"]), kind, default, sentence(parameter.get("description", ""))))
-    answers = operation["responses"]["200"].get("content", {})
-    told = [f"Answers {', '.join(map(code, sorted(answers)))}."]
+    answers = operation["responses"].get("200", {}).get("content", {})
+    told = [f"Answers {', '.join(map(code, sorted(answers)))}."] if answers else []
     told += [
         f"{status}: {operation['responses'][status]['description']}" for status in sorted(_refusals(operation) - always)
     ]

@@ -33,7 +33,10 @@ from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
 from server.api.settings import Settings, usable_cores
 from server.api.strict_requests import StrictRequests
+from server.api.uploads import Uploads
+from server.assets.clip_store import ClipStore
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.assets.upload_decoder import DecodingLimits
 from server.core.entity_tags import fingerprint
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.effect_costs import measure_costs
@@ -138,6 +141,7 @@ def create_app(
                 responses=responses,
                 readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool, encoders))),
                 encoders=encoders,
+                uploads=_uploads(settings),
                 peers=peers,
                 access=access,
             )
@@ -187,6 +191,13 @@ def create_app(
     if settings.page:
         app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
+
+
+def _uploads(settings: Settings) -> Uploads | None:
+    if settings.clips_folder is None:
+        return None
+    store = ClipStore(settings.clips_folder, quota_bytes=settings.clips_quota_bytes, expires_s=settings.clips_expire_s)
+    return Uploads(store, max_bytes=settings.max_clip_bytes, limits=DecodingLimits(settings.max_clip_s))
 
 
 def _turn_away(scope: Scope) -> Response | None:

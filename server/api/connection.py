@@ -45,7 +45,9 @@ from server.api.response_cache import ResponseCache
 from server.api.settings import Settings, usable_cores
 from server.api.stream_counts import StreamLedger
 from server.api.turn_taking import OneAtATime
+from server.api.uploads import Uploads
 from server.api.web_socket import FastPath
+from server.assets.clip_store import ClipStore, is_upload
 from server.assets.clips import ClipLibrary, DecodeError
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.core.errors import RequestError
@@ -120,12 +122,23 @@ again."""
 _UNCOUNTED_TYPE: Final = re.compile(r'"type"\s*:\s*"(listener|move_emitter|acknowledge|ping)"')
 
 
-def load_clip(clips: ClipLibrary, name: str) -> DryAudio:
+def load_clip(clips: ClipLibrary, uploads: ClipStore | None, name: str) -> DryAudio:
     """Raises RequestError unknown_clip, or undecodable_clip with the decoder's reason."""
     try:
-        return clips.load(name)
+        return uploads.load(name, clips.sample_rate) if uploads is not None and is_upload(name) else clips.load(name)
     except DecodeError as exc:
         raise RequestError("undecodable_clip", str(exc), field="clip") from exc
+
+
+def loaded_clip(clips: ClipLibrary, uploads: ClipStore | None, name: str) -> DryAudio:
+    """What `load_clip` has just loaded, at once. Raises RequestError server_busy if so many uploaded clips were loaded
+    since then that it is not there any more."""
+    if uploads is None or not is_upload(name):
+        return load_clip(clips, None, name)
+    audio = uploads.loaded(name, clips.sample_rate)
+    if audio is None:
+        raise RequestError("server_busy", f"too many clips are in use to play {name}", field="clip", retry_after_s=1)
+    return audio
 
 
 def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
@@ -215,6 +228,8 @@ class StreamHost:
     readiness: Readiness
     encoders: ThreadPool
     """The threads that encode blocks in encodings that take their time."""
+    uploads: Uploads | None = None
+    """Takes clips that clients upload, if the server does."""
     peers: ProcessPeers | None = None
     """The processes that serve at one port, if this is one of them."""
     access: Access | None = None
@@ -253,6 +268,11 @@ class StreamHost:
         self.kept = KeptStreams(
             keep_s=self.settings.resume_s, most=self.settings.max_streams, give_up=self.admission.leave
         )
+
+    @property
+    def clip_store(self) -> ClipStore | None:
+        """The clips that were uploaded; None if the server takes none."""
+        return None if self.uploads is None else self.uploads.store
 
     @property
     def streams(self) -> int:
@@ -648,7 +668,7 @@ class Connection:
             hello,
             levels,
             filters,
-            lambda name: load_clip(clips, name),
+            lambda name: loaded_clip(clips, host.clip_store, name),
             quality=quality,
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
@@ -776,7 +796,7 @@ class Connection:
             if isinstance(message, AddEmitter) and message.clip is not None:
                 # Decoded here, off the event loop, so that the audio thread need not wait.
                 clips = self._host.clips[hello.scene].at_rate(stream.sample_rate)
-                await asyncio.to_thread(load_clip, clips, message.clip)
+                await asyncio.to_thread(load_clip, clips, self._host.clip_store, message.clip)
             self._pass_on(message, stream)
         except RequestError as refusal:
             self._refuse(refusal, message)

@@ -7,6 +7,8 @@ from server.api.settings import Settings
 HEALTH_PATHS = "/livez", "/readyz"
 """Paths for process supervisors. They are answered for any `Host`, and also when all other connections are taken."""
 
+UPLOAD_PATH = "/v1/clips"
+
 
 @dataclass(frozen=True)
 class ConnectionLimits:
@@ -20,6 +22,9 @@ class ConnectionLimits:
     max_body_bytes: int
     request_timeout_s: float
     response_timeout_s: float
+    max_upload_bytes: int
+    """Longest body of `POST` to `UPLOAD_PATH`; as other bodies where there are no uploads."""
+    upload_timeout_s: float
     max_connections: int
     max_connections_per_address: int
     reserve_connections: int = 32
@@ -35,6 +40,8 @@ class ConnectionLimits:
             max_body_bytes=settings.max_body_bytes,
             request_timeout_s=settings.request_timeout_s,
             response_timeout_s=settings.response_timeout_s,
+            max_upload_bytes=settings.max_body_bytes if settings.clips_folder is None else settings.max_clip_bytes,
+            upload_timeout_s=settings.request_timeout_s if settings.clips_folder is None else settings.upload_timeout_s,
             max_connections=settings.max_connections,
             max_connections_per_address=min(settings.max_connections_per_address, settings.max_connections),
         )

@@ -16,7 +16,7 @@ from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
-from server.api.connection_limits import HEALTH_PATHS, ConnectionLimits
+from server.api.connection_limits import HEALTH_PATHS, UPLOAD_PATH, ConnectionLimits
 from server.api.problems import Refusal, problem
 from server.api.request_meter import RequestMeter
 from server.api.resetting import reset
@@ -98,6 +98,8 @@ class HttpProtocol(HttpToolsProtocol):
         """The answer if the parser refuses the request."""
         self._due_s: float | None = None
         """When the request has to be complete, or when a refused client is cut off."""
+        self._timeout_s = room.limits.request_timeout_s
+        """How long the present request may take to arrive."""
         self._unsent: tuple[int, float] | None = None
         """Bytes that the client has not read yet, and since when the number has not fallen."""
         self._waiting = bytearray()
@@ -226,12 +228,17 @@ class HttpProtocol(HttpToolsProtocol):
     def _is_health_check(self) -> bool:
         return self.url.partition(b"?")[0] in _HEALTH
 
+    @property
+    def _is_upload(self) -> bool:
+        return self.parser.get_method() == b"POST" and self.url.partition(b"?")[0] == UPLOAD_PATH.encode()
+
     # Handling of incoming bytes.
 
     def _read(self, data: bytes) -> bytes:
         """Parse the next part of the present request. Returns the bytes after it."""
         if self._due_s is None:
-            self._due_s = self.loop.time() + self._room.limits.request_timeout_s
+            self._timeout_s = self._room.limits.request_timeout_s
+            self._due_s = self.loop.time() + self._timeout_s
         measured = self._meter.measure(data)
         if isinstance(measured, Refusal):
             self._refuse(measured)
@@ -247,6 +254,11 @@ class HttpProtocol(HttpToolsProtocol):
         assert self._seat is not None
         if self._seat.is_reserve and not self._is_health_check:
             return _NO_ROOM
+        if self._is_upload:
+            limits = self._room.limits
+            self._meter.allow_body(limits.max_upload_bytes)
+            self._timeout_s = limits.upload_timeout_s
+            self._due_s = self.loop.time() + self._timeout_s
         refusal = self._meter.expect_body(0)
         for name, value in self.headers:
             if name == b"content-length":
@@ -290,7 +302,7 @@ class HttpProtocol(HttpToolsProtocol):
         elif self._meter.is_fresh:
             self.transport.close()
         else:
-            within = f"within {self._room.limits.request_timeout_s:g} s"
+            within = f"within {self._timeout_s:g} s"
             self._refuse(Refusal(408, "request_timeout", f"a request has to be complete {within}"))
 
     def _refuse(self, refusal: Refusal) -> None:

@@ -28,6 +28,9 @@ _REFUSED: Final[dict[str, str]] = {
 }
 """Refusals that every route has."""
 _OF_A_SCENE: Final = {"404": "There is no such scene, or the scene has no such place or level; `code` says which."}
+_OF_A_CLIP: Final = {"404": "There is no such clip, or it has expired."}
+_OF_A_FIXED_CLIP: Final = {"409": "The clip was not uploaded, so it stays."}
+_OF_A_STORE: Final = {"507": "The server has no room for the clip; `code` says which."}
 _OF_A_HEAD: Final = {"404": "There is no such head, or no scene has this sample rate; `code` says which."}
 _OF_A_COMPUTATION: Final = {
     "409": "The request asks for more than this scene allows, or its settings contradict each other."
@@ -56,7 +59,7 @@ _PROBLEM: Final[Object] = {
         "field": {"anyOf": [{"type": "string"}, {"type": "null"}]},
     },
 }
-_OF_A_BODY: Final = {"415": "The body is not JSON."}
+_OF_A_BODY: Final = {"415": "The body is of another type than the route reads."}
 _COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/plan")
 _TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder", "/bundle/{file}")
 _RANGED: Final = "/bundle/{file}"
@@ -113,10 +116,12 @@ def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
                     parameter["example"] = example
                 else:
                     parameter["schema"]["examples"] = [example]
-            operation["responses"] |= _refusals(path, has_body="requestBody" in operation)
+            operation["responses"] |= _refusals(
+                path, has_body="requestBody" in operation, changes=method in {"post", "delete"}
+            )
             if "security" in operation:
                 operation["responses"] |= _described(_NO_KEY)
-            for kind, content in operation["responses"]["200"].get("content", {}).items():
+            for kind, content in operation["responses"].get("200", {}).get("content", {}).items():
                 if kind == "application/json" and path in answer_examples():
                     content["example"] = answer_examples()[path]
             if path.endswith(_RANGED):
@@ -126,7 +131,7 @@ def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
     return document
 
 
-def _refusals(path: str, *, has_body: bool) -> Object:
+def _refusals(path: str, *, has_body: bool, changes: bool) -> Object:
     refused = dict(_REFUSED)
     if has_body:
         refused |= _OF_A_BODY
@@ -134,6 +139,12 @@ def _refusals(path: str, *, has_body: bool) -> Object:
         refused |= _OF_A_SCENE
     if "{hrtf}" in path:
         refused |= _OF_A_HEAD
+    if "{clip}" in path:
+        refused |= _OF_A_CLIP
+    if "/clips" in path and changes:
+        refused |= _OF_A_STORE
+    if "{clip}" in path and changes:
+        refused |= _OF_A_FIXED_CLIP
     if path.endswith(_COMPUTED):
         refused |= _OF_A_COMPUTATION
     if path.endswith(_RANGED):

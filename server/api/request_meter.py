@@ -38,12 +38,17 @@ class RequestMeter:
         self._has_request_line = False
         self._body_bytes = 0
         self._body_length: int | None = None
+        self._max_body_bytes = self._limits.max_body_bytes
+
+    def allow_body(self, max_bytes: int) -> None:
+        """Let the body of this request be so long."""
+        self._max_body_bytes = max_bytes
 
     def expect_body(self, length: int | None) -> Refusal | None:
         """Set the length of the body; None for a chunked body, whose end the parser finds. Returns a refusal if it is
         too long."""
         self._body_length = length
-        return self._too_large() if length is not None and length > self._limits.max_body_bytes else None
+        return self._too_large() if length is not None and length > self._max_body_bytes else None
 
     @property
     def has_body(self) -> bool:
@@ -61,7 +66,7 @@ class RequestMeter:
         else:
             rest = b""
         self._body_bytes += len(data)
-        return self._too_large() if self._body_bytes > self._limits.max_body_bytes else Measured(data, rest)
+        return self._too_large() if self._body_bytes > self._max_body_bytes else Measured(data, rest)
 
     def _measure_head(self, data: bytes) -> Measured | Refusal:
         at = 0
@@ -110,4 +115,4 @@ class RequestMeter:
         return False
 
     def _too_large(self) -> Refusal:
-        return Refusal(413, "body_too_large", f"a body has at most {self._limits.max_body_bytes} bytes")
+        return Refusal(413, "body_too_large", f"a body has at most {self._max_body_bytes} bytes")

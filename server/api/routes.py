@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, WebSocket
-from fastapi.responses import StreamingResponse
+from fastapi.responses import JSONResponse, StreamingResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BeforeValidator, Field
 from starlette.requests import ClientDisconnect
@@ -26,6 +26,8 @@ from server.api.ranged_files import RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
+from server.assets.clip_store import is_upload
+from server.assets.clips import Clip, UnknownClipError
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import computed_tag, content_tag
 from server.core.errors import RequestError
@@ -98,6 +100,26 @@ _BATCH_BODY = {
 _FILE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
 _FILE_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 _SCHEMA_TYPES: dict[str, Any] = {"content": {"application/schema+json": {"schema": {"type": "object"}}}}
+_BYTES = "application/octet-stream"
+_FILE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+_CLIP_BODY = {
+    "required": True,
+    "description": "The audio file itself. Its content says what it is, whatever the type.",
+    "content": dict.fromkeys((_BYTES, "audio/wav", "audio/flac", "audio/ogg", "audio/mpeg"), _FILE),
+}
+_A_CLIP = {
+    "content": {
+        "application/json": {
+            "example": {
+                "name": "upload-0f1e2d3c4b5a69788796a5b4c3d2e1f0",
+                "title": "A door",
+                "duration_s": 1.25,
+                "credit": "",
+                "expires_at": "2027-01-08T12:00:00+00:00",
+            }
+        }
+    }
+}
 _MAP_TYPES = {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
 _MAP_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 
@@ -400,12 +422,8 @@ def _schema_text() -> bytes:
 
 @api.get("/clips")
 async def clips(request: Request) -> dict[str, Any]:
-    """Clips that emitters can play."""
-    host = _host(request)
-    named = {}
-    for library in set(host.clips.values()):
-        for clip in await anyio.to_thread.run_sync(playable_clips, library):
-            named[clip.name] = clip
+    """Clips that emitters can play, those that were uploaded among them."""
+    named = await anyio.to_thread.run_sync(_clips_by_name, _host(request))
     return {"clips": [named[name] for name in sorted(named)]}
 
 
@@ -413,6 +431,62 @@ async def clips(request: Request) -> dict[str, Any]:
 async def encodings() -> dict[str, Any]:
     """Encodings of the live stream that this server has, and at which sample rates (null: at any)."""
     return {"encodings": describe_encodings()}
+
+
+@api.post(
+    "/clips",
+    status_code=201,
+    responses={
+        200: {"model": Clip, "description": "The same file is there already. It keeps its title and expires later."},
+        201: {"model": Clip, "description": "The clip is stored. `Location` has its address.", **_A_CLIP},
+    },
+    response_model=None,
+    openapi_extra={"requestBody": _CLIP_BODY},
+)
+async def upload_clip(
+    request: Request,
+    title: Annotated[str, Query(max_length=120, description="what listeners are shown", examples=["A door"])] = "",
+) -> Response:
+    """Store an audio file as a clip, which streams can play at once by the name in the answer: wav, flac, mp3, or ogg
+    with Vorbis, Opus or FLAC. The body is the file itself. The name comes from the content, so the same file has the
+    same name."""
+    uploads = _host(request).uploads
+    if uploads is None:
+        raise RequestError("uploads_off", "this server takes no clips: set NAFIR_CLIPS_FOLDER", status=403)
+    _require_audio(request)
+    try:
+        clip, is_new = await uploads.receive(request.stream(), title)
+    except ClientDisconnect:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    location = {"Location": f"{request.scope.get('root_path', '')}/v1/clips/{clip.name}"}
+    return JSONResponse(asdict(clip), status_code=201 if is_new else 200, headers=location)
+
+
+@api.get("/clips/{clip}")
+async def one_clip(request: Request, clip: str) -> Clip:
+    """One clip, as in the list of all."""
+    named = await anyio.to_thread.run_sync(_clips_by_name, _host(request))
+    if clip not in named:
+        raise UnknownClipError(clip)
+    return named[clip]
+
+
+@api.delete("/clips/{clip}", status_code=204)
+async def delete_clip(request: Request, clip: str) -> Response:
+    """Delete an uploaded clip. Emitters that play it go on."""
+    host = _host(request)
+    if host.clip_store is not None and is_upload(clip):
+        await anyio.to_thread.run_sync(host.clip_store.remove, clip)
+        return Response(status_code=204)
+    if clip in await anyio.to_thread.run_sync(_clips_by_name, host):
+        raise RequestError("fixed_clip", f"clip {clip!r} was not uploaded and stays", field="clip", status=409)
+    raise UnknownClipError(clip)
+
+
+def _clips_by_name(host: StreamHost) -> dict[str, Clip]:
+    fixed = (clip for library in set(host.clips.values()) for clip in playable_clips(library))
+    uploaded = () if host.clip_store is None else host.clip_store.clips()
+    return {clip.name: clip for clip in (*uploaded, *fixed)}
 
 
 @api.get("/hrtfs")
@@ -478,6 +552,14 @@ def _require_json(request: Request) -> None:
     kind = request.headers.get("content-type", "application/json").partition(";")[0].strip().lower()
     if kind != "application/json":
         problem = f"the body is {kind[:80]!r}, and JSON is needed: send Content-Type: application/json"
+        raise RequestError("unsupported_media_type", problem, status=415)
+
+
+def _require_audio(request: Request) -> None:
+    """Raises RequestError unsupported_media_type for a body that is said to be something else than a file."""
+    kind = request.headers.get("content-type", _BYTES).partition(";")[0].strip().lower()
+    if kind not in {_BYTES, "application/ogg"} and not kind.startswith("audio/"):
+        problem = f"the body is {kind[:80]!r}: send the audio file itself, with Content-Type: {_BYTES} or audio/..."
         raise RequestError("unsupported_media_type", problem, status=415)
 
 

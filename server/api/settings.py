@@ -21,7 +21,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from server.assets.names import named_by_stem
 from server.core.errors import NafirError
-from server.core.files import require_readable
+from server.core.files import require_readable, require_writable_folder
 from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 from server.runtime.open_files import allow_connections
@@ -112,6 +112,19 @@ class Settings(BaseSettings):
     """Seconds between two looks at `bundle_folder`. What has changed is loaded at the look after."""
     clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, besides those that come with the package."""
+    clips_folder: Path | None = None
+    """Folder for clips that clients upload with `POST /v1/clips`; it is made if need be. Without it there are no
+    uploads."""
+    clips_quota_bytes: Annotated[int, Field(ge=2**20)] = 2**30
+    """Bytes that uploaded clips may take together in `clips_folder`, where they are kept decoded: 4 bytes a sample."""
+    clips_expire_s: Annotated[float, Field(ge=60)] = 7 * 86_400.0
+    """How long a clip is kept after it was uploaded last."""
+    max_clip_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 16 * 2**20
+    """Longest file of a clip that may be uploaded."""
+    max_clip_s: Annotated[float, Field(gt=0, le=600)] = 120.0
+    """Longest clip that may be uploaded."""
+    upload_timeout_s: Annotated[float, Field(gt=0)] = 60.0
+    """Time for a whole upload to arrive, in place of `request_timeout_s`."""
     hrtfs: NamedFiles = ()
     """SOFA files (SimpleFreeFieldHRIR) to offer as heads, named by their stem, besides KEMAR."""
 
@@ -156,7 +169,7 @@ class Settings(BaseSettings):
     max_headers_bytes: Annotated[int, Field(ge=1024)] = 32 * 1024
     """Longest headers of a request, all together. A single header and the request line may have 8,000 bytes each."""
     max_body_bytes: Annotated[int, Field(ge=0, le=64 * 1024)] = 64 * 1024
-    """Longest body of a request."""
+    """Longest body of a request other than an upload."""
     max_poses: Annotated[int, Field(ge=1)] = 256
     """Impulse responses that one request may ask for."""
     requests_per_min: Annotated[int, Field(ge=0)] = 6_000
@@ -246,4 +259,6 @@ def checked_settings(given: Mapping[str, Any]) -> Settings:
     for name in ("keys_file", "jwt_keys_file"):
         if (path := getattr(settings, name)) is not None:
             require_readable(path, name)
+    if settings.clips_folder is not None:
+        require_writable_folder(settings.clips_folder, "clips_folder")
     return settings

@@ -9,6 +9,7 @@ Arrays are `(sample, channel)`.
 import re
 import stat
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -48,15 +49,24 @@ class Recording:
         return len(self.samples) / self.sample_rate
 
 
-def read_audio(path: Path) -> Recording:
-    """Read any file that libsndfile reads. The content decides the format, not the name. Raises AudioFileError, also
-    for more than `MOST_VALUES` samples."""
+Limit = Callable[[soundfile.SoundFile], int]
+"""Says of an opened file how many samples, over all channels, may be read. It may raise AudioFileError."""
+
+
+def unlimited(_: soundfile.SoundFile) -> int:
+    """Lets `MOST_VALUES` samples be read of any file."""
+    return MOST_VALUES
+
+
+def read_audio(path: Path, limit: Limit = unlimited) -> Recording:
+    """Read any file that libsndfile reads. The content decides the format, not the name. `limit` is asked before
+    anything is decoded. Raises AudioFileError, also for more samples than `limit` allows."""
     content = _content(path)
     sizes = _sizes(content)
     if sizes is not None and sizes.is_short:
         content = sizes.corrected(content)
     try:
-        samples, rate, promised = _decoded(content)
+        samples, rate, promised = _decoded(content, limit)
     except (OSError, soundfile.LibsndfileError) as exc:
         reason = str(getattr(exc, "error_string", exc)).rstrip(".") or "damaged"
         raise AudioFileError(f"not an audio file that can be read ({reason})") from exc
@@ -79,7 +89,7 @@ def _content(path: Path) -> bytes:
         raise AudioFileError(getattr(exc, "strerror", None) or str(exc)) from exc
 
 
-def _decoded(content: bytes) -> tuple[FloatArray, int, int]:
+def _decoded(content: bytes, limit: Limit) -> tuple[FloatArray, int, int]:
     """Samples, rate, and the number of samples by the header. A damaged stream is read up to the damage."""
     parts: list[FloatArray] = []
     rate = promised = 0
@@ -87,17 +97,17 @@ def _decoded(content: bytes) -> tuple[FloatArray, int, int]:
     for block in _BLOCKS:
         # Without a file name, so that the content alone decides the format.
         with soundfile.SoundFile(BytesIO(content)) as file:
-            rate, promised = file.samplerate, file.frames
+            rate, promised, most = file.samplerate, file.frames, limit(file)
             for part in parts:
                 file.read(len(part), dtype="float32")
-            if _is_read_to_its_end(file, block, parts):
+            if _is_read_to_its_end(file, block, parts, most):
                 break
     if not parts:
         raise AudioFileError("not an audio file that can be read (its first samples are damaged)")
     return np.concatenate(parts), rate, promised
 
 
-def _is_read_to_its_end(file: soundfile.SoundFile, block: int, parts: list[FloatArray]) -> bool:
+def _is_read_to_its_end(file: soundfile.SoundFile, block: int, parts: list[FloatArray], most: int) -> bool:
     """Read the rest and append it to `parts`. Returns False if a decoding error ends it early."""
     values = sum(part.size for part in parts)
     while True:
@@ -107,8 +117,8 @@ def _is_read_to_its_end(file: soundfile.SoundFile, block: int, parts: list[Float
             return False
         parts.append(part)
         values += part.size
-        if values > MOST_VALUES:
-            raise AudioFileError(f"it holds more than {MOST_VALUES} samples; cut it")
+        if values > most:
+            raise AudioFileError(f"it holds more than {most} samples; cut it")
         if len(part) < block:
             return True
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import soxr
 
-from server.assets.audio_file import AudioFileError, read_audio, to_mono
+from server.assets.audio_file import AudioFileError, Limit, read_audio, to_mono, unlimited
 from server.core.errors import NafirError, RequestError
 from server.rendering.ingest import LOUDEST, DryAudio
 
@@ -46,12 +46,14 @@ class UnknownClipError(RequestError):
 
 @dataclass(frozen=True)
 class Clip:
-    """Description of a clip. `credit` is empty for the user's own files."""
+    """Description of a clip. `credit` is empty for the user's own files. Uploaded clips expire at `expires_at` (ISO
+    8601)."""
 
     name: str
     title: str
     duration_s: float
     credit: str
+    expires_at: str | None = None
 
 
 def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAudio:
@@ -61,28 +63,37 @@ def decode(path: Path, sample_rate: int, *, channel: int | None = None) -> DryAu
     louder one is used. The log warns of that and of wrong headers. Raises DecodeError.
     """
     try:
-        recording = read_audio(path)
-        samples = recording.samples
-        if samples.shape[0] == 0:
-            raise AudioFileError("it holds no samples")
-        # Before averaging and resampling, which would spread one bad sample over many.
-        is_bad = ~np.isfinite(samples).all(axis=1)
-        # guard: a file of no audio is refused
-        if is_bad.any():
-            raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
-        # guard: a file beyond the loudest is refused
-        if (peak := np.abs(samples).max()) > LOUDEST:
-            raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
-        mono, downmix = to_mono(samples, channel)
+        mono, rate, findings = read_mono(path, channel=channel)
     except AudioFileError as exc:
         raise DecodeError(path.name, str(exc)) from exc
-    for finding in filter(None, (recording.finding, downmix)):
+    for finding in findings:
         _logger.warning("warning: %s: %s", path, finding)
-    if recording.sample_rate != sample_rate:
-        mono = soxr.resample(mono, recording.sample_rate, sample_rate, quality="VHQ")
+    if rate != sample_rate:
+        mono = soxr.resample(mono, rate, sample_rate, quality="VHQ")
         if mono.size == 0:
             raise DecodeError(path.name, f"too short to be heard at {sample_rate} Hz")
     return DryAudio(mono)
+
+
+def read_mono(
+    path: Path, *, channel: int | None = None, limit: Limit = unlimited
+) -> tuple[FloatArray, int, tuple[str, ...]]:
+    """The samples of an audio file, mixed as `decode` does, their rate, and warnings. `limit` is that of `read_audio`.
+    Raises AudioFileError."""
+    recording = read_audio(path, limit)
+    samples = recording.samples
+    if samples.shape[0] == 0:
+        raise AudioFileError("it holds no samples")
+    # Before averaging and resampling, which would spread one bad sample over many.
+    is_bad = ~np.isfinite(samples).all(axis=1)
+    # guard: a file of no audio is refused
+    if is_bad.any():
+        raise AudioFileError(f"{is_bad.sum()} samples are not finite, the first at {is_bad.argmax()}")
+    # guard: a file beyond the loudest is refused
+    if (peak := np.abs(samples).max()) > LOUDEST:
+        raise AudioFileError(f"its peak of {peak:.3g} is not audio, where full scale is 1")
+    mono, downmix = to_mono(samples, channel)
+    return mono, recording.sample_rate, tuple(filter(None, (recording.finding, downmix)))
 
 
 class ClipLibrary:

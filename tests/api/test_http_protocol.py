@@ -27,7 +27,8 @@ WITHIN_S = 4.0
 
 
 async def application(scope, receive, send):
-    """`/slow` waits for a while, `/large` has 64 MiB, `/body` waits for the body, all others answer their path."""
+    """`/slow` waits for a while, `/large` has 64 MiB, `/body` and `/v1/clips` wait for the body, all others answer
+    their path."""
     if scope["type"] == "websocket":
         await receive()
         await send({"type": "websocket.accept"})
@@ -36,7 +37,7 @@ async def application(scope, receive, send):
     path = scope["path"]
     if path == "/slow":
         await asyncio.sleep(0.5)
-    if path == "/body":
+    if path in {"/body", "/v1/clips"}:
         while (await receive()).get("more_body"):
             pass
     pieces = [CHUNK] * 1024 if path == "/large" else [path.encode()]
@@ -160,6 +161,38 @@ def test_a_head_that_never_ends_is_refused_and_the_client_sees_why(begin, piece,
 )
 def test_a_body_too_large_is_refused(pieces):
     assert problem_of(talk(*pieces)[0]) == (413, "body_too_large")
+
+
+UPLOADS = {"clips_folder": "/nowhere", "max_clip_bytes": 100_000}
+
+
+def post(path, size, *, is_chunked=False):
+    """A request with a body of so many bytes."""
+    if is_chunked:
+        head = get(path, b"Transfer-Encoding: chunked", CLOSE, method="POST")
+        return head + b"%x\r\n" % size + b"x" * size + b"\r\n0\r\n\r\n"
+    return get(path, b"Content-Length: %d" % size, CLOSE, method="POST") + b"x" * size
+
+
+@pytest.mark.parametrize("is_chunked", [False, True])
+def test_an_upload_may_be_longer_than_other_bodies(is_chunked):
+    for path in ("/v1/clips", "/v1/clips?title=x"):
+        heard, _ = talk(post(path, 99_000, is_chunked=is_chunked), **UPLOADS)
+        assert heard.startswith(b"HTTP/1.1 200")
+        assert problem_of(talk(post(path, 100_001, is_chunked=is_chunked), **UPLOADS)[0]) == (413, "body_too_large")
+        assert problem_of(talk(post(path, 1_001, is_chunked=is_chunked))[0]) == (413, "body_too_large"), "no uploads"
+    for path in ("/v1/clips/x", "/v1/scenes", "/body"):
+        assert problem_of(talk(post(path, 1_001, is_chunked=is_chunked), **UPLOADS)[0]) == (413, "body_too_large")
+
+
+def test_an_upload_has_its_own_time():
+    slow = [get("/body", b"Content-Length: 20", CLOSE, method="POST"), *[b"x"] * 20]
+    upload = [get("/v1/clips", b"Content-Length: 20", CLOSE, method="POST"), *[b"x"] * 20]
+    assert problem_of(talk(*slow, pause_s=0.1, **UPLOADS)[0]) == (408, "request_timeout")
+    heard, _ = talk(*upload, pause_s=0.1, upload_timeout_s=5.0, **UPLOADS)
+    assert heard.startswith(b"HTTP/1.1 200")
+    heard, _ = talk(*upload, pause_s=0.1, upload_timeout_s=0.5, **UPLOADS)
+    assert problem_of(heard) == (408, "request_timeout")
 
 
 def test_a_body_that_grows_too_large_after_the_answer_gets_no_second_one():
