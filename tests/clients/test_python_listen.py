@@ -1,6 +1,8 @@
 """`nafir-client listen` and `nafir listen`, against a real server."""
 
+import re
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from nafir_client.wire import Block
 from server.cli.main import app
 from server.core.errors import NafirError
 from server.offline.render import read_path
+from tests.clients.vectors import CLIENTS, readme_commands
 
 
 def recorded(output):
@@ -46,6 +49,39 @@ def test_a_walk_is_recorded_with_its_path(served, tmp_path, capsys):
     said = capsys.readouterr().out
     assert f"{output}: " in said
     assert "underruns" in said
+
+
+def test_the_last_of_the_readmes_three_lines_listens(served, tmp_path):
+    install, serve, listen = readme_commands("python")
+    assert (install, serve) == ("pip install 'client_examples/python[listen]'", "nafir serve &")
+    output = tmp_path / "heard.wav"
+    program, *arguments = listen.replace("127.0.0.1:8000", served).split()
+    assert program in tomllib.loads((CLIENTS / "python" / "pyproject.toml").read_text())["project"]["scripts"]
+    main([*arguments, "--scene", "flat", "--seconds", "0.5", "--silent", "-o", str(output)])
+    assert recorded(output)[0] > 0
+
+
+def readme_programs():
+    """The Python in the README."""
+    text = (CLIENTS / "python" / "README.md").read_text()
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_the_readmes_program_for_asyncio_prints_the_peaks_of_blocks(served, capsys):
+    program = readme_programs()[0].replace("127.0.0.1:8000", served).replace("apartment", "flat")
+    program = program.replace("abs(block.samples).max())", "abs(block.samples).max()) or block.sequence < 99 or stop()")
+
+    class StopError(Exception):
+        pass
+
+    def stop():
+        raise StopError
+
+    with pytest.raises(StopError):
+        exec(program, {"stop": stop})
+    peaks = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
+    assert len(peaks) == 100
+    assert max(peaks) > 1e-4
 
 
 def test_one_who_stays_hears_from_one_place(served, tmp_path):
