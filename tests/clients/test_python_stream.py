@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import soundfile
 
 import nafir_client
 from nafir_client import Backoff, ConnectionLostError, RefusedError, UnreachableError
@@ -332,6 +333,30 @@ def served_without_resume(bundle, hrtfs):
         yield address
 
 
+def test_a_file_that_is_uploaded_can_be_played_and_deleted(bundle, hrtfs, tmp_path, monkeypatch):
+    monkeypatch.setenv("NAFIR_CLIPS_FOLDER", str(tmp_path / "clips"))
+    file = tmp_path / "door.wav"
+    soundfile.write(file, np.random.default_rng(1).standard_normal(24_000) / 10, 24_000)
+
+    async def play(address, clip):
+        async with connect(address) as stream:
+            await stream.add_emitter(clip=clip)
+            return loudness(await blocks_of(stream, 60))
+
+    with serving(FieldsByLevel.load(bundle), hrtfs) as address:
+        client = nafir_client.Client(f"http://{address}")
+        name = client.upload(file, title="A door")
+        assert name in client.clips()
+        assert running(play(address, name)) > 1e-3
+        client.delete_clip(name)
+        assert name not in client.clips()
+        with pytest.raises(RefusedError, match="unknown_clip"):
+            client.delete_clip(name)
+        file.write_bytes(b"no sound")
+        with pytest.raises(RefusedError, match="undecodable_clip"):
+            client.upload(file)
+
+
 def test_a_lost_connection_is_made_anew_with_the_emitters_the_level_and_the_pose(served_without_resume):
     async def listen():
         async with proxy(served_without_resume) as way, connect(way.address, reconnect=SOON) as stream:
@@ -412,11 +437,13 @@ def test_a_stream_that_is_not_to_come_back_ends_with_its_connection(served):
     async def listen():
         async with proxy(served) as way, connect(way.address, reconnect=None) as stream:
             await blocks_of(stream, 3)
+            assert stream.is_connected
             way.cut()
             with pytest.raises(ConnectionLostError, match=re.escape(f"ws://{way.address}: ")) as lost:
                 await blocks_of(stream, 1_000)
             with pytest.raises(ConnectionLostError):
                 await stream.move_listener((2.0, 2.0, 1.5))
+            assert not stream.is_connected
             return lost.value
 
     assert running(listen()).is_passing

@@ -121,13 +121,14 @@ def served_directional(hrtfs, tmp_path_factory):
         yield address
 
 
-def test_two_ears_hear_an_ambisonic_stream_and_turn_at_once(served_directional):
-    with connect(served_directional, output="ambisonics", head="kemar") as stream:
+@pytest.mark.parametrize("sample_rate", [24_000, 48_000])
+def test_two_ears_hear_an_ambisonic_stream_and_turn_at_once(served_directional, sample_rate):
+    with connect(served_directional, output="ambisonics", head="kemar", sample_rate=sample_rate) as stream:
         assert (stream.channels, stream.welcome.channels) == (2, 4)
         # To the left of one who looks north, and to the right of one who looks south.
         stream.add_emitter(clip="woman-reading", position=(1.0, 2.5, 1.5))
         stream.move_listener((4.0, 2.5, 1.5), yaw=np.pi / 2)
-        facing_north = np.sqrt(np.mean(played(stream, 1.5)[-24_000:] ** 2, axis=0))
+        facing_north = np.sqrt(np.mean(played(stream, 1.5)[-sample_rate:] ** 2, axis=0))
         stream.move_listener((4.0, 2.5, 1.5), yaw=-np.pi / 2)
         facing_south = np.sqrt(np.mean(played(stream, 1.0)[1_000:] ** 2, axis=0))
     assert facing_north[0] > 1.1 * facing_north[1]

@@ -9,6 +9,7 @@ import urllib.request
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -57,6 +58,20 @@ class Client:
     def clips(self) -> list[str]:
         """Names of the clips that an emitter can play."""
         return [each["name"] for each in self._get_json("clips")["clips"]]
+
+    def upload(self, path: Path | str, *, title: str = "") -> str:
+        """Store an audio file on the server. Returns the name by which an emitter plays it as its clip. Raises OSError
+        for a file that cannot be read."""
+        url = f"{self._base}/clips" + (f"?{urllib.parse.urlencode({'title': title})}" if title else "")
+        headers = {**self._headers, "Content-Type": "application/octet-stream"}
+        # A body of bytes has a length; one that is read as it goes would have to be sent in chunks.
+        request = urllib.request.Request(url, data=Path(path).read_bytes(), headers=headers)
+        return str(_read_json(url, self._answer(request))["name"])
+
+    def delete_clip(self, name: str) -> None:
+        """Delete an uploaded clip. Emitters that play it go on."""
+        url = f"{self._base}/clips/{_quoted(name)}"
+        self._answer(urllib.request.Request(url, headers=self._headers, method="DELETE"))
 
     def heads(self) -> list[str]:
         """Names of the heads that a stream can be rendered for."""

@@ -29,11 +29,6 @@ class LiveInput:
         self._at_server = 0
         self._is_open = False
 
-    @property
-    def room(self) -> int:
-        """How many samples can be written before any are dropped."""
-        return self._longest - self.waiting
-
     def write(self, samples: Samples) -> None:
         """Append samples (n,)."""
         self._chunks.append(np.array(samples, np.float32))

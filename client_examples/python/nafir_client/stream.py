@@ -184,6 +184,7 @@ class Stream:
         self._failure: NafirClientError | None = None
         self._is_closed = False
         self.is_connected = False
+        """Whether there is a connection at present."""
 
     async def __aenter__(self) -> Self:
         started_s = time.monotonic()
