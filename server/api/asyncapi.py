@@ -118,6 +118,10 @@ in the old connection, it is taken over and closed with {TAKEN_OVER}. What live 
 go on with the next `dry_block`. Statistics and the window begin anew. A `resume` is refused like a `hello` while the
 server has no room (`server_busy`), and may be tried again.
 
+**Snapshots.** Where the operator has set a secret, a message `snapshot` has the whole state, signed: before a shutdown,
+and every few seconds if the `hello` asks for `snapshots`. A `resume` with the newest one goes on at any server that has
+the same scenes and the same secret, within {_default("snapshot_lifetime_s"):g} s, whatever has become of the first.
+
 **Flow control by acknowledgement.** At most `window` blocks (see `welcome`) are sent without an `acknowledge`. One
 `acknowledge` stands for all earlier blocks, so every fourth block or so is enough. While the window is full, blocks are
 rendered but not sent: `sequence` has no gap then, and `sample_clock` jumps. Once the window has been full for
@@ -132,7 +136,8 @@ poses come directly after one another, the server may read only the newest.
 
 **Errors.** A refused message changes nothing, and the stream goes on, unless it was the hello. An `error` that ends the
 connection is followed by a close frame whose reason is the error's code. A server that shuts down sends every stream
-the error `server_draining` and closes it with 1012; the client may open it again, there or elsewhere.
+a `snapshot`, if it gives any, and the error `server_draining` with the seconds until it has ended (`retry_after_s`),
+and closes it with 1012; the client may resume or open it again, there or elsewhere.
 
 **An exchange**
 

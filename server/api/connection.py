@@ -79,6 +79,7 @@ from server.protocol.codes import (
     ACCESS_ENDED,
     GOODBYES,
     INTERNAL_ERROR,
+    LOST,
     NORMAL,
     POLICY_VIOLATION,
     SERVICE_RESTART,
@@ -87,8 +88,8 @@ from server.protocol.codes import (
 )
 from server.protocol.opus import OpusOptions
 from server.protocol.packets import BlockEncoder, LiveDecoders
-from server.protocol.server_messages import EmitterEnded, Error, Pong, Resumed, ServerMessage, Welcome
-from server.protocol.snapshot import MOST_BYTES, Snapshot
+from server.protocol.server_messages import EmitterEnded, Error, Pong, Resumed, ServerMessage, SnapshotTaken, Welcome
+from server.protocol.snapshot import MOST_BYTES, Seal, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.logs import about
@@ -115,7 +116,9 @@ SUBPROTOCOL: Final = f"nafir.v{PROTOCOL}"
 _GOODBYE_S = 1.0
 """Limit for sending the close frame. It waits for room in the socket, which a client that does not read never makes."""
 _STATE_S = 1.0
-"""Limit for the state of a stream to come from its audio thread, which usually takes a block."""
+"""Limit for the state of a stream to come from its audio thread, which is woken for it."""
+_SNAPSHOT_PERIOD_S = 3.0
+"""Time between two snapshots of a stream: what its client would have to send again if the server was lost."""
 _UNCOUNTED: Final = ListenerPose | MoveEmitter | DryBlock | DryPackets | Acknowledge | Ping
 """Messages that do not count as handled (`Snapshot.handled`): they have numbers of their own, or need not be sent
 again."""
@@ -158,7 +161,6 @@ class Goodbye:
 
 
 _TOO_SLOW: Final = Goodbye(POLICY_VIOLATION, Error(code="reads_too_slowly", message="the client reads too slowly"))
-_DRAINING: Final = Goodbye(SERVICE_RESTART, Error(code="server_draining", message="the server is shutting down"))
 _TAKEN_OVER: Final = Goodbye(
     TAKEN_OVER, Error(code="taken_over", message="the client has resumed the stream on another connection")
 )
@@ -252,6 +254,10 @@ class StreamHost:
     """The places of all streams, open or being opened."""
     kept: KeptStreams = dataclasses.field(init=False)
     """Streams that have lost their clients."""
+    seal: Seal | None = dataclasses.field(init=False)
+    """Signs snapshots; None without a secret."""
+    wall_s: Callable[[], float] = time.time
+    """The clock that hosts share, in seconds since 1970."""
     openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
     """Creates sessions one after the other, since each takes about 8 ms of CPU time."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
@@ -264,6 +270,12 @@ class StreamHost:
             cores=usable_cores(),
             is_on=self.settings.admission,
             thresholds=dataclasses.replace(THRESHOLDS, ir_share=self.settings.ir_share),
+        )
+        secret = self.settings.resume_secret
+        self.seal = (
+            None
+            if secret is None
+            else Seal(secret.get_secret_value().encode(), lifetime_s=self.settings.snapshot_lifetime_s)
         )
         self.kept = KeptStreams(
             keep_s=self.settings.resume_s, most=self.settings.max_streams, give_up=self.admission.leave
@@ -380,8 +392,8 @@ class Connection:
         self._goodbye: Goodbye | None = None
         """Why the connection is to end."""
         self._is_ending = asyncio.Event()
-        self._close_code: int | None = None
-        """The client's, once it is known."""
+        self._left_with: int | None = None
+        """The close code with which the client left, once it is known."""
         self._stream: Stream | None = None
         self._place: Place | None = None
         self._encoding: SampleEncoding = "f32"
@@ -394,10 +406,10 @@ class Connection:
         """Whether the client has shown that it has the token."""
         self._has_resumed = False
         self._handled = 0
+        self._parting: SnapshotTaken | None = None
+        """The last snapshot, for a client whose stream the shutdown has ended."""
         self._state: asyncio.Future[StreamState] | None = None
         """The state that the audio thread was asked for."""
-        self._left_with = NORMAL
-        """The close code with which the client left, if it did."""
         self._figures: dict[str, float] | None = None
         """What is told of a stream when it has ended."""
 
@@ -416,7 +428,7 @@ class Connection:
 
     def _log_end(self, goodbye: Goodbye | None) -> None:
         """Say why a connection has ended."""
-        reason: dict[str, object] = {"reason": "client_left", "close_code": self._left_with}
+        reason: dict[str, object] = {"reason": "client_left", "close_code": self._left_with or LOST}
         if goodbye is not None:
             error = goodbye.error
             reason = {"reason": error.code, "close_code": goodbye.close_code, "detail": error.message}
@@ -428,17 +440,26 @@ class Connection:
     async def _say(self, goodbye: Goodbye) -> None:
         with contextlib.suppress(TimeoutError, WebSocketDisconnected):  # a client that has gone is told nothing
             async with asyncio.timeout(_GOODBYE_S):
+                if self._parting is not None:
+                    await self._send_message(self._parting)
                 await self._send_message(goodbye.error)
                 await self._websocket.close(goodbye.close_code, goodbye.error.code)
 
     async def _serve_until_drained(self) -> Goodbye | None:
         drain = self._host.readiness.drain
         if drain.has_begun:
-            return _DRAINING
+            return self._draining()
         try:
             return await run_until(self._serve(), drain.begun())
         except StoppedError:
-            return _DRAINING
+            return self._draining()
+
+    def _draining(self) -> Goodbye:
+        """What a client is told during the shutdown: how long it lasts, and how to go on."""
+        seconds = self._host.readiness.drain.retry_after_s
+        how = "open the stream again" if self._parting is None else "resume with the snapshot"
+        message = f"the server is shutting down: {how}, at another or here in {seconds} s"
+        return Goodbye(SERVICE_RESTART, Error(code="server_draining", message=message, retry_after_s=seconds))
 
     async def _serve(self) -> Goodbye | None:
         """Serve the client. Returns None if the client has gone, or else the reason to end the connection."""
@@ -513,9 +534,17 @@ class Connection:
         """Take over the stream that a client asks for. Raises RequestError unknown_resume_token, and
         unsupported_protocol."""
         require_protocol(asked)
-        kept = await self._host.kept.take(asked.token)
-        if kept is None:
-            problem = f"no stream is kept for this token, or its {self._host.kept.keep_s:g} s are over: send a hello"
+        host = self._host
+        kept = None if asked.token is None else await host.kept.take(asked.token)
+        if kept is not None:
+            host.kept.outcomes["resumed"] += 1
+        elif asked.snapshot is not None and host.seal is not None:
+            data, plays_at = host.seal.open(asked.snapshot, now=host.wall_s())
+            kept = KeptStream(data, self._time_s() + plays_at - host.wall_s())
+            host.kept.outcomes["resumed_from_snapshot"] += 1
+        else:
+            host.kept.outcomes["unknown"] += 1
+            problem = f"no stream is kept for this token, or its {host.kept.keep_s:g} s are over: send a hello"
             raise RequestError("unknown_resume_token", problem, field="token", status=404)
         try:
             return _LostStream(asked, kept, Snapshot.parse(kept.data))
@@ -584,7 +613,7 @@ class Connection:
         self._live_decoders = LiveDecoders(field.sample_rate, settings.max_emitters)
         self._session = uuid.uuid4().hex if lost is None else lost.snapshot.session
         if self._host.kept.keep_s:
-            former = None if lost is None else lost.asked.token
+            former = lost.asked.token if lost is not None and lost.kept.tokens else None
             self._token = self._host.kept.open(partial(self._end, _TAKEN_OVER), former=former)
         await self._send_message(
             Welcome(
@@ -621,7 +650,11 @@ class Connection:
     def _continue(self, session: Session, lost: _LostStream, block_s: float) -> Resumed:
         """Set the clock of a session to where that of a `lost` stream would be if the next block played now."""
         snapshot, sequence = lost.snapshot, lost.asked.sequence
-        blocks = max(0, math.ceil((self._time_s() - lost.kept.plays_s) / block_s) + 1)
+        most = math.ceil(max(self._host.kept.keep_s, self._host.settings.snapshot_lifetime_s) / block_s)
+        blocks = math.ceil((self._time_s() - lost.kept.plays_s) / block_s) + 1
+        if lost.asked.sample_clock is not None:  # the clock never goes back, even if that of a host does
+            blocks = max(blocks, (lost.asked.sample_clock - snapshot.sample_clock) // snapshot.hello.block_size + 1)
+        blocks = min(max(0, blocks), most)
         sample_clock = snapshot.sample_clock + blocks * snapshot.hello.block_size
         resumed = Resumed(
             sample_clock=sample_clock,
@@ -701,6 +734,8 @@ class Connection:
         access, caller = self._host.access, caller_of(self._websocket.scope)
         if access is not None and caller is not None:
             tasks.append(asyncio.create_task(_end_of_access(access, caller)))
+        if hello.snapshots and self._host.seal is not None:
+            tasks.append(asyncio.create_task(self._send_snapshots(stream)))
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             has_gone = any(task.result() is None for task in done)
@@ -714,6 +749,10 @@ class Connection:
             if self._may_come_back(ending):
                 await self._keep(stream, place)
             return ending
+        except asyncio.CancelledError:
+            if self._host.readiness.drain.has_begun:
+                self._parting = await self._seal(stream)
+            raise
         finally:
             self._host.audio.close(stream)
             self._host.ledger.close(stream)
@@ -730,7 +769,7 @@ class Connection:
     def _may_come_back(self, ending: Goodbye | None) -> bool:
         """Whether the client has neither said goodbye nor lost its stream by a fault."""
         if ending is None:
-            return self._close_code not in GOODBYES
+            return self._left_with not in GOODBYES
         return ending not in (_FAILED, _ENDINGS["key_revoked"])
 
     async def _keep(self, stream: Stream, place: Place) -> None:
@@ -745,6 +784,30 @@ class Connection:
             return
         is_held = self._host.admission.keep(place)
         self._host.kept.close(self._token, KeptStream(data, state.plays_s, place if is_held else None))
+
+    async def _send_snapshots(self, stream: Stream) -> Goodbye:
+        while True:
+            await asyncio.sleep(_SNAPSHOT_PERIOD_S)
+            if (taken := await self._seal(stream)) is not None:
+                self._enqueue([taken])
+
+    async def _seal(self, stream: Stream) -> SnapshotTaken | None:
+        """A sealed snapshot of the stream; None without a secret, or if it would be too long."""
+        host = self._host
+        state = None if host.seal is None else await self._take_state(stream)
+        if state is None or host.seal is None:
+            return None
+        now = host.wall_s()
+        data = state.snapshot.model_dump_json().encode()
+        sealed = host.seal.close(data, plays_at=now + state.plays_s - self._time_s(), now=now)
+        if sealed is None:
+            return None
+        return SnapshotTaken(
+            snapshot=sealed,
+            pose_id=state.snapshot.pose_id,
+            handled=state.snapshot.handled,
+            expires_s=host.seal.lifetime_s,
+        )
 
     async def _take_state(self, stream: Stream) -> StreamState | None:
         """The state of the stream after all messages that were passed on; None if its audio thread does not answer."""
@@ -764,14 +827,12 @@ class Connection:
             emitters = self._host.settings.max_emitters
             self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=stream.sample_rate))
             self._fast_path.listen(self._handle_at_once)
-        try:
+        with contextlib.suppress(WebSocketDisconnect):
             while True:
                 data = await self._receive()
                 self._is_handling = True
                 await self._handle(data, stream, hello)
                 self._is_handling = False
-        except WebSocketDisconnect as gone:
-            self._close_code = gone.code
 
     def _handle_at_once(self, data: str | bytes) -> bool:
         """Handle a message that needs only the audio thread. Returns False, and does nothing, for any other message or
@@ -848,8 +909,8 @@ class Connection:
     async def _receive(self) -> str | bytes:
         event = await self._websocket.receive()
         if event["type"] == "websocket.disconnect":
-            self._left_with = event.get("code", NORMAL)
-            raise WebSocketDisconnect(self._left_with)
+            code = self._left_with = event.get("code", NORMAL)
+            raise WebSocketDisconnect(code)
         text: str | None = event.get("text")
         return event["bytes"] if text is None else text
 

@@ -28,7 +28,8 @@ _PATIENCE_S = 2.0
 @dataclass(eq=False)
 class KeptStream:
     """A stream to go on with: its snapshot as JSON, and when the snapshot's next block would play, in seconds of the
-    clock of the audio engine. `place` is held for it, if there was one to hold."""
+    clock of the audio engine. `place` is held for it, if there was one to hold. One that a client has kept itself has
+    no `tokens`."""
 
     data: bytes
     plays_s: float
@@ -53,7 +54,9 @@ class KeptStreams:
 
     def __init__(self, *, keep_s: float, most: int, give_up: Callable[[Place], None]) -> None:
         self.keep_s = keep_s
-        self.outcomes: Counter[str] = Counter(dict.fromkeys(("kept", "resumed", "expired", "unknown"), 0))
+        self.outcomes: Counter[str] = Counter(
+            dict.fromkeys(("kept", "resumed", "resumed_from_snapshot", "expired", "unknown"), 0)
+        )
         """How often a stream was kept, went on, or did not come back, and how often a token was not known."""
         self._most = most
         self._give_up = give_up
@@ -112,13 +115,14 @@ class KeptStreams:
             except TimeoutError:
                 pass
         kept = self._kept.get(token)
-        self.outcomes["unknown" if kept is None else "resumed"] += 1
         if kept is not None:
             self._remove(kept)
         return kept
 
     def put_back(self, kept: KeptStream) -> None:
         """Keep a stream that could not go on, as long as it was to be kept."""
+        if not kept.tokens:
+            return
         loop = asyncio.get_running_loop()
         self._kept.update(dict.fromkeys(kept.tokens, kept))
         self._order[kept] = None

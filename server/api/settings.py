@@ -11,6 +11,7 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
+    SecretStr,
     ValidationError,
     ValidationInfo,
     field_validator,
@@ -192,6 +193,11 @@ class Settings(BaseSettings):
     """How long a client may acknowledge nothing while its window is full, before its connection is closed."""
     resume_s: Annotated[float, Field(ge=0, le=600)] = 15.0
     """How long a stream whose connection was lost is kept for its client to resume it; 0 keeps none."""
+    resume_secret: Annotated[SecretStr, Field(min_length=16)] | None = None
+    """What servers sign snapshots of streams with, at least 16 characters. A client resumes its stream from a snapshot
+    at any server that has the same scenes and the same secret, also after a restart. Without it there are none."""
+    snapshot_lifetime_s: Annotated[float, Field(gt=0, le=3600)] = 120.0
+    """How long a snapshot is good: longer than a server takes to restart."""
     max_waiting_requests: Annotated[int, Field(ge=1)] = 32
     """HTTP computations that may wait for a thread; equal requests count once. Beyond that a client is answered 503."""
     drain_s: Annotated[float, Field(ge=2, le=3600)] = 8.0

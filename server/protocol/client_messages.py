@@ -110,7 +110,8 @@ class Hello(Message):
     them by its listener's orientation and decodes them; a turn then changes nothing in the blocks. `effects` switches
     effects on or off, whatever the plan would decide. `emitters` is how many emitters the client is about to add: the
     server lets the stream in only if they fit, and keeps room for them for some seconds. Without it the server expects
-    as many as other streams have."""
+    as many as other streams have. With `snapshots` the server sends a `snapshot` every few
+    seconds, if it gives any."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -128,6 +129,7 @@ class Hello(Message):
     emitters: Annotated[int, Field(ge=0, le=64), WHOLE] | None = None
     # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
+    snapshots: bool = False
 
     @field_validator("order")
     @classmethod
@@ -153,15 +155,23 @@ class Hello(Message):
 
 class Resume(Message):
     """The first message of a client whose connection was lost, in place of a `hello`: the stream goes on, with its
-    emitters, clips, gains, level, effects and clock. `token` is that of the last `welcome`. `sequence` and
+    emitters, clips, gains, level, effects and clock. `token` is that of the last `welcome`, `snapshot` that of the last
+    message `snapshot`; one of them is needed, and if the server knows the token it needs no snapshot. `sequence` and
     `sample_clock` are those of the last block that arrived: later blocks have greater ones. The answer is a `welcome`
     with `resumed`, or the error `unknown_resume_token`, after which a `hello` begins anew."""
 
     type: Literal["resume"] = "resume"
     protocol: Integer
-    token: Annotated[str, Field(max_length=64)]
+    token: Annotated[str, Field(max_length=64)] | None = None
+    snapshot: Annotated[str, Field(max_length=48 * 1024)] | None = None
     sequence: Annotated[int, Field(ge=0, lt=2**32), WHOLE] | None = None
     sample_clock: Annotated[int, Field(ge=0, lt=2**62), WHOLE] | None = None
+
+    @model_validator(mode="after")
+    def _has_something_to_go_on_from(self) -> Self:
+        if self.token is None and self.snapshot is None:
+            raise PydanticCustomError("malformed_resume", "give token, snapshot or both")
+        return self
 
 
 class DirectivityPattern(Message):

@@ -15,14 +15,14 @@ or broke the protocol. After any other the connection was lost."""
 
 ERROR_CODES: Final[Mapping[str, str]] = {
     "not_ready": "the server is still warming up, or a thread of its own has failed; the message says which",
-    "server_draining": "the server is shutting down; open the stream again, there or elsewhere",
+    "server_draining": "the server is shutting down; resume with the snapshot, or begin anew, there or elsewhere",
     "key_expired": "the key or token that opened the stream has expired; connect again with a new one",
     "key_revoked": "the key that opened the stream, or signed its token, was revoked; connect again with a valid one",
     "server_busy": "the stream, emitter, level or effect would break somebody's sound, or no stream is free; ask later",
     "hello_expected": "the first message was not a hello, or none came in time",
     "unexpected_hello": "a stream has one hello",
     "unexpected_resume": "a resume is the first message on a connection",
-    "unknown_resume_token": "no stream is kept for this token, or no longer; begin anew with a hello",
+    "unknown_resume_token": "no stream is kept for this token, or no longer, and there is no good snapshot; begin anew",
     "taken_over": "the client has resumed the stream on another connection",
     "unsupported_protocol": "the server speaks another version of the protocol",
     "unsupported_sample_rate": "the scene is not rendered at this sample rate; the message lists those it is",

@@ -38,6 +38,7 @@ from server.protocol.server_messages import (
     Resumed,
     SceneDescription,
     ServerMessage,
+    SnapshotTaken,
     Status,
     Welcome,
 )
@@ -227,6 +228,10 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     Step("lets the talker stop in the middle of a word", StopEmitter(id="talker", stop_at=96_000, fade_s=0.02)),
     Step("takes the microphone away", RemoveEmitter(id="me")),
     Step("it is gone", EmitterRemoved(id="me")),
+    Step(
+        "hands the client the state of the stream, every few seconds if the hello asked for it",
+        SnapshotTaken(snapshot="c2lnbmVkIHN0YXRlIG9mIHRoZSBzdHJlYW0=", pose_id=4, handled=6, expires_s=120.0),
+    ),
     Step(
         "after a gap of the network, on a new connection, asks to go on",
         Resume(protocol=PROTOCOL, token="4qVh3mXv0y8Jc1tYb2Rk9wLs6dZf7GpA", sequence=564, sample_clock=144_384),

@@ -98,6 +98,19 @@ class Welcome(Message):
     opus: Annotated[OpusStreams | None, Field(exclude_if=lambda opus: opus is None)] = None
 
 
+class SnapshotTaken(Message):
+    """The state of the stream, signed, for a client to keep: with the newest one it can resume the stream at any server
+    of the same scenes and the same secret within `expires_s` seconds, even if this one is gone. It comes every few
+    seconds if the `hello` asked for `snapshots`, and before `server_draining`. `pose_id` and `handled` say what it
+    includes, as in `resumed`."""
+
+    type: Literal["snapshot"] = "snapshot"
+    snapshot: str
+    pose_id: int
+    handled: int
+    expires_s: float
+
+
 class EmitterAdded(Message):
     """The emitter's first impulse response is in effect. Its clip begins at `sample_clock`: with the next block or at
     the `start_at` of its `add_emitter`, if that is later. A live emitter begins then too, once enough of its samples
@@ -274,7 +287,16 @@ class Error(Message):
 
 
 ServerMessage = (
-    Welcome | EmitterAdded | EmitterEnded | EmitterRemoved | LevelChanged | PlanChanged | Status | Pong | Error
+    Welcome
+    | SnapshotTaken
+    | EmitterAdded
+    | EmitterEnded
+    | EmitterRemoved
+    | LevelChanged
+    | PlanChanged
+    | Status
+    | Pong
+    | Error
 )
 _SERVER: TypeAdapter[ServerMessage] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 

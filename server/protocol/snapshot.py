@@ -3,9 +3,19 @@
 A snapshot consists of the messages that would bring about the state: a hello, and an `add_emitter` for each emitter. So
 it is validated as they are when it comes back, and a field that a message gains is kept by itself. Where clips are
 follows from the sample clock.
+
+A *sealed* snapshot is one that a client keeps: text with a signature, which any server takes that has the same secret.
+It is no secret, since it says only what the client itself has said.
 """
 
-from typing import Annotated
+import base64
+import binascii
+import hashlib
+import hmac
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 from pydantic import Field, ValidationError
 
@@ -13,6 +23,12 @@ from server.core.errors import RequestError
 from server.protocol.client_messages import AddEmitter, Hello, PoseId, StopEmitter
 from server.protocol.message import Message
 
+MOST_SEALED: Final = 48 * 1024
+"""Longest sealed snapshot, which fits into a message."""
+_SIGNED_FOR: Final = b"nafir snapshot 1:"
+"""Keeps signatures apart from any others by the same secret."""
+_TIMES: Final = struct.Struct("<dd")
+_SIGNATURE_BYTES: Final = hashlib.sha256().digest_size
 MOST_BYTES = 512 * 1024
 """Longest snapshot as JSON. Sixteen emitters with measured directivities of five degrees have a tenth of it."""
 
@@ -49,3 +65,41 @@ class Snapshot(Message):
         except ValidationError as exc:
             problem = "the snapshot was made by another version of the server: begin with a hello"
             raise RequestError("unknown_resume_token", problem, field="snapshot") from exc
+
+
+@dataclass(frozen=True)
+class Seal:
+    """Signs snapshots by HMAC-SHA256 with a `secret`. They are good for `lifetime_s`."""
+
+    secret: bytes
+    lifetime_s: float
+
+    def close(self, data: bytes, *, plays_at: float, now: float) -> str | None:
+        """Seal a snapshot as JSON whose next block plays at `plays_at`; None if it is too long. Times are seconds since
+        1970."""
+        payload = _TIMES.pack(plays_at, now + self.lifetime_s) + zlib.compress(data)
+        sealed = base64.urlsafe_b64encode(self._sign(payload) + payload).decode()
+        return sealed if len(sealed) <= MOST_SEALED else None
+
+    def open(self, sealed: str, *, now: float) -> tuple[bytes, float]:
+        """Return the snapshot as JSON, and when its next block would have played. Raises RequestError
+        unknown_resume_token for one that this secret has not signed, or whose time is over."""
+        try:
+            signed = base64.b64decode(sealed, altchars=b"-_", validate=True)
+        except (binascii.Error, ValueError):
+            signed = b""
+        signature, payload = signed[:_SIGNATURE_BYTES], signed[_SIGNATURE_BYTES:]
+        # guard: nothing of a snapshot is read before its signature is checked
+        if not hmac.compare_digest(signature, self._sign(payload)):
+            raise _unusable("the snapshot is not one of this server's, or was changed")
+        plays_at, until = _TIMES.unpack_from(payload)
+        if now > until:
+            raise _unusable(f"the snapshot is older than {self.lifetime_s:g} s")
+        return zlib.decompress(payload[_TIMES.size :]), plays_at
+
+    def _sign(self, payload: bytes) -> bytes:
+        return hmac.digest(self.secret, _SIGNED_FOR + payload, "sha256")
+
+
+def _unusable(problem: str) -> RequestError:
+    return RequestError("unknown_resume_token", f"{problem}: begin with a hello", field="snapshot", status=404)

@@ -1,21 +1,32 @@
 """Streams whose connections break. What is heard before and after the gap is compared, sample by sample, with a render
 of the whole clip: where a clip is shows where the clock is."""
 
+import asyncio
 import json
+import os
 import socket
+import subprocess
+import sys
+import threading
 import time
+import urllib.request
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import uvicorn
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.geometry import Pose
+from server.api.app import create_app
+from server.api.serving import Server, uvicorn_options
+from server.api.settings import Settings
 from server.assets.clips import ClipLibrary
 from server.field.field import AcousticField
+from server.field.fields_by_level import FieldsByLevel
 from server.offline.render import PathPoint, RenderedEmitter, render
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import (
@@ -31,8 +42,10 @@ from server.protocol.client_messages import (
 )
 from server.protocol.opus import OpusOptions
 from server.protocol.packets import BlockReader
-from server.protocol.server_messages import EmitterAdded, Error, Welcome, parse_server_message
+from server.protocol.server_messages import EmitterAdded, Error, SnapshotTaken, Welcome, parse_server_message
+from server.protocol.snapshot import Seal
 from server.responses.direct_sound import DirectSound
+from server.runtime.drain import Drain
 from server.scene.effects import EffectName
 from tests.integration.lossy_proxy import LossyProxy
 
@@ -319,3 +332,111 @@ def test_a_server_told_to_keep_nothing_gives_no_token(monkeypatch, request):
         socket.send(HELLO.serialize())
         welcome = json.loads(socket.recv(timeout=5))
     assert not {"resume_token", "resume_s", "resumed"} & welcome.keys()
+
+
+@contextmanager
+def serving_until_drained(bundle, hrtfs, secret="a secret of both servers"):
+    """HOST:PORT of a server with a secret, and what begins its shutdown. It ends by itself then."""
+    drain = Drain(3.0)
+    settings = Settings(port=0, resume_secret=secret)
+    app = create_app(settings, scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs, drain=drain)
+    server = Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)), drain)
+    server.install_signal_handlers = lambda: None
+    loops = []
+
+    async def serve():
+        loops.append(asyncio.get_running_loop())
+        await server.serve()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.02)
+        address = "{}:{}".format(*server.servers[0].sockets[0].getsockname())
+        wait_until_ready(address)
+        yield address, lambda: loops[0].call_soon_threadsafe(drain.begin)
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+def wait_until_ready(address, patience_s=60.0):
+    end_s = time.monotonic() + patience_s
+    while time.monotonic() < end_s:
+        with suppress(OSError), urllib.request.urlopen(f"http://{address}/readyz", timeout=5):
+            return
+        time.sleep(0.05)
+    raise AssertionError("the server never became ready")
+
+
+def test_a_server_that_shuts_down_hands_its_streams_to_another(bundle, hrtfs, expected):
+    """It says how long that takes, and the stream goes on at a server that has the same secret."""
+    other = serving_until_drained(bundle, hrtfs)
+    with serving_until_drained(bundle, hrtfs) as (old, shut_down), other as (new, _), listening(old) as before:
+        since = begin(before)
+        shut_down()
+        ending = before.to_the_end()
+        assert (ending.code, ending.reason) == (1012, "server_draining")
+        snapshot, error = before.messages[-2:]
+        assert (snapshot.type, error.code) == ("snapshot", "server_draining")
+        assert 1 <= error.retry_after_s <= 3
+        assert snapshot.handled == 1
+        with listening(new, before.resumption(snapshot=snapshot.snapshot)) as again:
+            resumed = again.first.resumed
+            assert again.first.session == before.first.session
+            assert resumed.sequence == before.blocks[-1].sequence + 1
+            assert before.blocks[-1].sample_clock < resumed.sample_clock < before.blocks[-1].sample_clock + 3 * RATE
+            again.hear(SETTLED + RATE // 4)
+        assert error_db(after(again.blocks, SETTLED), expected, since) < -80
+        forged = before.resumption(token=None, snapshot=snapshot.snapshot[:-8] + "AAAAAAA=")
+        with listening(new, forged) as stranger:
+            assert (stranger.first.code, stranger.first.field) == ("unknown_resume_token", "snapshot")
+
+
+@pytest.mark.untimed
+def test_without_a_secret_there_are_no_snapshots(served):
+    with listening(served, HELLO.model_copy(update={"snapshots": True})) as listener:
+        listener.until(AudioBlock)
+        snapshot = Seal(b"of nobody", 60.0).close(b"{}", plays_at=time.time(), now=time.time())
+    with listening(served, listener.resumption(token=None, snapshot=snapshot)) as again:
+        assert again.first.code == "unknown_resume_token"
+
+
+@pytest.mark.long
+def test_a_server_that_is_killed_costs_a_fade(bundle, expected):
+    """Its client has kept the newest snapshot, goes on with it at another server, and learns what is not in it."""
+    environment = {**os.environ, "NAFIR_RESUME_SECRET": "a secret of both servers", "NAFIR_BUNDLES": str(bundle.folder)}
+    ports = [free_port() for _ in range(2)]
+    servers = [
+        subprocess.Popen([sys.executable, "-m", "server", "serve", "--port", str(port)], env=environment)
+        for port in ports
+    ]
+    try:
+        killed, other = (f"127.0.0.1:{port}" for port in ports)
+        for address in (killed, other):
+            wait_until_ready(address, 300.0)
+        with listening(killed, HELLO.model_copy(update={"snapshots": True})) as before:
+            since = begin(before)
+            snapshot = before.until(SnapshotTaken, patience_s=10.0)
+            before.send(SetGain(id="talker", gain_db=0.0))
+            before.hear(RATE // 2)
+            servers[0].kill()
+            servers[0].wait()
+            assert before.to_the_end() is None
+        with listening(other, before.resumption(snapshot=snapshot.snapshot)) as again:
+            resumed = again.first.resumed
+            assert resumed.handled == 1  # the gain is to be set again
+            assert resumed.sample_clock > before.blocks[-1].sample_clock
+            assert resumed.sequence == before.blocks[-1].sequence + 1
+            again.hear(SETTLED + RATE // 2)
+        assert error_db(after(again.blocks, SETTLED), expected, since) < -80
+    finally:
+        for each in servers:
+            each.kill()
+            each.wait()

@@ -20,10 +20,11 @@ OF_CLIENTS = [
     '{"type": "hello", "protocol": 3, "scene": "flat"}',
     '{"type": "hello", "protocol": 3, "scene": "flat", "sample_rate": 48000, "block_size": 512, "encoding": "s16",'
     ' "listener": {"position": [1, 2, 1.5], "yaw": 0.5}, "hrtf": "kemar", "level": "fast", "output": "mono",'
-    ' "effects": {"diffraction": false}, "emitters": 2, "buffer_blocks": 4}',
+    ' "effects": {"diffraction": false}, "emitters": 2, "buffer_blocks": 4, "snapshots": true}',
     '{"type": "hello", "protocol": 3, "scene": "flat", "output": "ambisonics", "order": 3, "encoding": "opus",'
     ' "opus": {"frame_ms": 20, "bitrate": 96000, "complexity": 10, "application": "audio", "signal": "music"}}',
     '{"type": "resume", "protocol": 3, "token": "6f1a", "sequence": 7, "sample_clock": 2048}',
+    '{"type": "resume", "protocol": 3, "snapshot": "c3RhdGU="}',
     '{"type": "add_emitter", "id": "a", "clip": "speech", "position": [6, 3, 1.5], "yaw": 3.0, "gain_db": -6.0,'
     ' "loop": false, "directivity": {"pattern": "cardioid", "order": 2}}',
     '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "orientation": [0, 0, 0, 1]}',
@@ -64,6 +65,7 @@ OF_THE_SERVER = [
     + ', "order": 2, "opus": {"frame_samples": 240, "look_ahead": 60, "streams": [2, 2, 2, 2, 1]}}',
     _WELCOME[:-1] + ', "resume_token": "6f1a", "resume_s": 30.0, "resumed": {"sample_clock": 4096, "sequence": 8,'
     ' "pose_id": 3, "handled": 2}}',
+    '{"type": "snapshot", "snapshot": "c3RhdGU=", "pose_id": 3, "handled": 2, "expires_s": 120.0}',
     '{"type": "emitter_added", "id": "a", "sample_clock": 6144}',
     '{"type": "emitter_ended", "id": "a", "sample_clock": 9600, "removed": true}',
     '{"type": "emitter_removed", "id": "a"}',
