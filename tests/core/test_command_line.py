@@ -73,7 +73,7 @@ def test_every_command_is_strict(module):
 
 
 INPUTS = {
-    *("bundle", "clip", "costs", "hrtf", "path"),
+    *("bundle", "clip", "costs", "file", "hrtf", "path"),
     *("as_long_as", "data", "points", "predictions", "teacher"),
 }
 OUTPUTS = {"output", "figure"}

@@ -160,6 +160,7 @@ def welcome(bounds):
         name="",
         description="",
         sample_rate=24_000,
+        sample_rates=(24_000,),
         ir_samples=64,
         channels=("left", "right"),
         speed_of_sound=343.0,
