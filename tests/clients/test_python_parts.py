@@ -280,6 +280,21 @@ def test_what_is_no_message_is_an_error_of_the_protocol(session, bad):
         session.receive(bad, 0.0)
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [
+        '{"type": "status", "live": [{}]}',
+        '{"type": "status", "live": 1}',
+        '{"type": "level_changed", "level": "a", "sample_clock": "late"}',
+        '{"type": "emitter_added", "id": [], "sample_clock": 0}',
+        '{"type": "pong", "id": {}}',
+    ],
+)
+def test_a_message_with_impossible_fields_is_an_error_of_the_protocol(session, bad):
+    with pytest.raises(ProtocolError, match="of the server cannot be read"):
+        session.receive(bad, 0.0)
+
+
 def test_a_refused_hello_has_all_that_the_server_says():
     error = {"type": "error", "code": "server_busy", "message": "full", "field": None, "retry_after_s": 3, "level": "a"}
     with pytest.raises(RefusedError) as refused:

@@ -449,6 +449,19 @@ def test_a_stream_that_is_not_to_come_back_ends_with_its_connection(served):
     assert running(listen()).is_passing
 
 
+def test_a_callback_that_fails_ends_the_stream_and_the_error_says_so(served):
+    def fail(message):
+        raise KeyError(message["type"])
+
+    async def listen():
+        async with connect(served, on_message=fail) as stream:
+            await blocks_of(stream, 10_000)
+
+    with pytest.raises(nafir_client.NafirClientError, match="the stream's task failed: KeyError") as failed:
+        running(listen())
+    assert isinstance(failed.value.__cause__, KeyError)
+
+
 def test_a_stream_that_is_closed_gives_what_has_arrived_and_ends(served):
     async def listen():
         async with connect(served) as stream:

@@ -223,7 +223,11 @@ class Session:
         """Take a message of the server. Returns None for kinds of binary messages that are not known. Raises
         ProtocolError."""
         if isinstance(data, str):
-            return self._receive_message(_read(data), now_s)
+            message = _read(data)
+            try:
+                return self._receive_message(message, now_s)
+            except (KeyError, TypeError, ValueError, AttributeError) as exc:
+                raise ProtocolError(f"a {message['type']} of the server cannot be read: {exc!r}") from exc
         return self._receive_block(data, now_s) if data[:1] == bytes([BLOCK_KIND]) else None
 
     def move_listener(self, pose: Pose, now_s: float) -> int:

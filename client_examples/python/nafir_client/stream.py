@@ -433,6 +433,10 @@ class Stream:
                 self.statistics.reconnections += 1
         except NafirClientError as exc:
             self._end(exc)
+        except Exception as exc:  # noqa: BLE001  a callback's: whoever waits for blocks has to learn of it
+            failure = NafirClientError(f"the stream's task failed: {exc!r}")
+            failure.__cause__ = exc
+            self._end(failure)
 
     async def _serve(self, socket: ClientConnection) -> ConnectionLostError:
         """Read and write until the connection ends. Raises ProtocolError for what cannot be read."""
