@@ -218,6 +218,10 @@ class AddEmitter(_Directed):
     are the clip's ends by default, without a gap. From `stop_at` on it fades out over 10 ms; a `stop_emitter` may do
     that too. A clip that has not begun by then is not heard.
 
+    Samples of a live emitter wait for `jitter_ms`, by default for two blocks, so that they may come unevenly. Where too
+    few have come in time, the sound fades out, and goes on after twice that wait. In the place of lost blocks there is
+    silence, faded out and in.
+
     Once a clip without `loop`, or a stopped one, has been heard to its end with its reverberation, an `emitter_ended`
     says so. With `remove_when_ended` the emitter is removed then, and its id is free.
     """
@@ -235,6 +239,7 @@ class AddEmitter(_Directed):
     loop_start_s: ClipTime = 0.0
     loop_end_s: ClipTime | None = None
     remove_when_ended: bool = False
+    jitter_ms: Annotated[FiniteFloat, Field(ge=2, le=250)] | None = None
 
     @model_validator(mode="after")
     def _has_one_sound(self) -> Self:
@@ -244,6 +249,8 @@ class AddEmitter(_Directed):
             raise _misplaced(given, "belongs to a clip, and the emitter is live")
         if not self.loop and (given := self._given(*_OF_LOOPS)):
             raise _misplaced(given, "belongs to a loop, and loop is false")
+        if not self.live and self.jitter_ms is not None:
+            raise _misplaced("jitter_ms", "belongs to a live emitter, and this one plays a clip")
         return self
 
     def _given(self, *names: str) -> str | None:

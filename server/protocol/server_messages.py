@@ -211,7 +211,8 @@ class Durations(Message):
 class LiveStatus(Message):
     """Counts of a live emitter's samples: `samples_queued` wait, `samples_dropped` came while too many waited,
     `samples_gated` were not audio and became silence, and `samples_concealed` stand for blocks in Opus that were lost.
-    `underruns` counts how often too few waited."""
+    `blocks_lost` counts the numbers missing between its blocks. `samples_awaited` have to wait before it plays, and
+    more after each underrun. `underruns` counts how often too few waited."""
 
     id: str
     samples_queued: int
@@ -219,6 +220,8 @@ class LiveStatus(Message):
     samples_gated: int
     samples_concealed: int = 0
     underruns: int
+    blocks_lost: int = 0
+    samples_awaited: int = 0
 
 
 class Status(Message):

@@ -206,6 +206,7 @@ class LiveSource:
         self._read = 0
         self._is_playing = self._fades_in = False
         self._waits_for = self._lead
+        self._risen = FADE_SAMPLES  # of the fade-in after lost samples
         self._overtaken: FloatArray | None = None  # the samples that would have come next, had they not been dropped
 
     def skip(self, _samples: int) -> None:
@@ -219,6 +220,11 @@ class LiveSource:
         clean = audio.samples
         # guard: gated samples are counted
         self.samples_gated += audio.silenced
+        if self._risen < FADE_SAMPLES:
+            clean = clean.copy()
+            rising = clean[: FADE_SAMPLES - self._risen]
+            rising *= self._fade_in[self._risen : self._risen + rising.size]
+            self._risen += rising.size
         capacity = self._ring.size
         self._drop(self.queued + clean.size - capacity)
         clean = clean[-capacity:]
@@ -227,6 +233,23 @@ class LiveSource:
         self._ring[start : start + first.size] = first
         self._ring[: clean.size - first.size] = clean[first.size :]
         self.queued += clean.size
+
+    def lose(self, count: int) -> None:
+        """Let silence take the place of `count` samples that were lost, but no more than the lead: the queue fades out
+        before it, and what comes next fades in. What waits to play has nothing to conceal."""
+        if not self._is_playing:
+            return
+        # At least so many samples are in the queue of what plays.
+        last = (self._read + self.queued - FADE_SAMPLES + np.arange(FADE_SAMPLES)) % self._ring.size
+        self._ring[last] *= 1 - self._fade_in
+        self._risen = FADE_SAMPLES
+        self.push(np.zeros(min(count, self._lead), np.float32))
+        self._risen = 0
+
+    @property
+    def target(self) -> int:
+        """How many samples wait before it begins, or begins again, to play."""
+        return self._waits_for
 
     def process(self, out: FloatArray) -> None:
         """Fill `out` (b,) with the next samples, or with silence if there are not enough."""

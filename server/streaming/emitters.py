@@ -16,7 +16,7 @@ from server.protocol.client_messages import AddEmitter, MoveEmitter, StopEmitter
 from server.protocol.server_messages import LiveStatus
 from server.protocol.snapshot import KeptEmitter
 from server.rendering.convolver import PartitionedIr
-from server.rendering.sources import LiveSource
+from server.rendering.sources import FADE_SAMPLES, LiveSource
 from server.responses.effect_flags import EmitterEffects
 from server.responses.emitter_state import EmitterState
 
@@ -233,12 +233,17 @@ class LiveInput:
     id: str
     source: LiveSource
     newest_sequence: int = -1
+    blocks_lost: int = field(default=0, init=False)
     samples_concealed: int = field(default=0, init=False)
     _gated_told: int = field(default=0, init=False)
 
     @classmethod
-    def opened(cls, identifier: str, *, sample_rate: int, block_size: int) -> "LiveInput":
-        lead = _LIVE_LEAD_BLOCKS * block_size
+    def opened(
+        cls, identifier: str, *, sample_rate: int, block_size: int, jitter_ms: float | None = None
+    ) -> "LiveInput":
+        """Samples wait for `jitter_ms` before they play, by default for two blocks."""
+        lead = _LIVE_LEAD_BLOCKS * block_size if jitter_ms is None else round(jitter_ms / 1000 * sample_rate)
+        lead = max(lead, FADE_SAMPLES + 1)
         capacity = max(round(_LIVE_QUEUE_S * sample_rate), 2 * lead)
         return cls(identifier, LiveSource(capacity=capacity, lead=lead))
 
@@ -247,7 +252,11 @@ class LiveInput:
         if block.sequence <= self.newest_sequence:
             problem = f"block {block.sequence} of emitter {self.id!r} is not newer than {self.newest_sequence}"
             raise RequestError("stale_block", problem, field="sequence")
+        lost = block.sequence - self.newest_sequence - 1 if self.newest_sequence >= 0 else 0
         self.newest_sequence = block.sequence
+        self.blocks_lost += lost
+        if lost and not block.concealed:
+            self.source.lose(lost * block.samples.size)
         self.samples_concealed += block.concealed
         self.source.push(block.samples)
 
@@ -261,6 +270,8 @@ class LiveInput:
             samples_gated=source.samples_gated,
             samples_concealed=self.samples_concealed,
             underruns=source.underruns,
+            blocks_lost=self.blocks_lost,
+            samples_awaited=source.target,
         )
 
     def complaint(self) -> RequestError | None:

@@ -470,7 +470,12 @@ class Session:
     def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
         if message.clip is not None:
             return None, self._open_clip(message, self._load_clip(message.clip))
-        live = LiveInput.opened(message.id, sample_rate=self._sample_rate, block_size=self.renderer.block_size)
+        live = LiveInput.opened(
+            message.id,
+            sample_rate=self._sample_rate,
+            block_size=self.renderer.block_size,
+            jitter_ms=message.jitter_ms,
+        )
         return live, live.source
 
     def _open_clip(self, message: AddEmitter, clip: DryAudio | FloatArray) -> ClipPlayer:

@@ -214,3 +214,28 @@ def test_it_stays_finite_bounded_and_smooth_whatever_happens(steps):
 def test_a_lead_that_cannot_be_kept_is_refused(lead):
     with pytest.raises(ValueError, match="lead"):
         live(lead=lead)
+
+
+@pytest.mark.parametrize("lost", [10, SIZE, 5 * SIZE])
+@pytest.mark.parametrize("piece", [7, SIZE])
+def test_lost_samples_are_a_silence_of_their_length_between_fades(lost, piece):
+    source = live(lead=2 * SIZE)
+    source.push(np.ones(3 * SIZE, np.float32))
+    heard = [play(source)]
+    source.lose(lost)
+    for _ in range(2 * SIZE // piece):
+        source.push(np.ones(piece, np.float32))
+    heard.append(play(source, (source.queued - FADE_SAMPLES) // SIZE))
+    assert source.underruns == 0
+    out, silent = np.concatenate(heard), min(lost, 2 * SIZE)
+    rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(FADE_SAMPLES) + 0.5) / FADE_SAMPLES)
+    expected = np.concatenate([np.ones(3 * SIZE - FADE_SAMPLES), rise[::-1], np.zeros(silent), rise, np.ones(2 * SIZE)])
+    np.testing.assert_allclose(out, expected[: out.size], atol=1e-6)
+    assert out.size > 3 * SIZE + silent
+
+
+def test_what_does_not_play_has_nothing_to_conceal():
+    source = live()
+    source.push(np.ones(SIZE, np.float32))
+    source.lose(100)
+    assert source.queued == SIZE

@@ -8,6 +8,7 @@ import pytest
 
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import (
     PROTOCOL,
     AddEmitter,
@@ -273,3 +274,27 @@ def test_short_sounds_leave_nothing_behind(field, filters, count):
     assert set(held(session).values()) == {0}
     assert asked == count, "one response each, and none for what has ended"
     assert grown < 120_000, f"{grown / count:.0f} bytes a sound"
+
+
+@pytest.mark.parametrize(("jitter_ms", "awaited"), [(None, 512), (50.0, 1_200), (2.0, 65)])
+def test_a_live_emitter_begins_when_as_much_waits_as_it_asked_for(session, jitter_ms, awaited):
+    session.receive(AddEmitter(id="me", live=True, position=THERE, jitter_ms=jitter_ms))
+    (status,) = session.live_statuses()
+    assert status.samples_awaited == awaited
+
+
+def test_lost_blocks_are_counted_and_their_time_is_silent(session, field):
+    session.receive(AddEmitter(id="me", live=True, position=THERE, jitter_ms=50.0))
+    answer(session, field)
+    for sequence in (0, 1, 2, 3, 4, 7):
+        session.receive(DryBlock("me", sequence, np.full(256, 0.01, np.float32)))
+        if sequence == 4:
+            hear(session, 1)
+    (status,) = session.live_statuses()
+    assert (status.blocks_lost, status.samples_queued, status.underruns) == (2, 4 * 256 + 2 * 256 + 256, 0)
+
+
+def test_a_wait_for_live_samples_belongs_to_a_live_emitter():
+    with pytest.raises(RequestError) as caught:
+        parse_client_message('{"type":"add_emitter","id":"a","position":[1,1,1],"clip":"a","jitter_ms":20}')
+    assert (caught.value.code, caught.value.field) == ("malformed_message", "jitter_ms")
