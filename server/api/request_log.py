@@ -88,7 +88,7 @@ class RequestLog:
 def _code_of(document: bytes) -> str | None:
     """The code of a problem document; None if it has none, as the answer to a HEAD."""
     try:
-        code = json.loads(document).get("code")
+        told = json.loads(document).get("code")
     except (ValueError, AttributeError):
         return None
-    return code if isinstance(code, str) else None
+    return told if isinstance(told, str) else None

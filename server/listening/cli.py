@@ -139,7 +139,7 @@ def _serve(folder: Path, given: dict[str, str | int | None]) -> None:
     asked = "choices" if test.design.kind == "choice" else "ratings"
     announcement = f"[bold]Nafir[/] asks for {asked} in {test.design.name} at [link]{url}[/]; answers: {test.results}"
     # The log of requests would hold addresses and codes together.
-    config = uvicorn.Config(application, access_log=False, **serving.uvicorn_options(settings))
+    config = uvicorn.Config(application, **serving.uvicorn_options(settings))
     try:
         serving.serve(
             serving.Server(config, drain, on_start=lambda: Console().print(announcement, highlight=False)), listeners

@@ -82,7 +82,8 @@ def test_after_the_end_none_is_begun(field, begun):
     assert not begun
 
 
-def test_progress_is_told_while_functions_are_compiled(monkeypatch, capsys):
+def test_progress_is_told_while_functions_are_compiled(monkeypatch, caplog):
+    caplog.set_level("INFO", first_start.__name__)
     counts = iter([3, 3, 7])
     monkeypatch.setattr(first_start, "functions_compiled", lambda: next(counts, 7))
     monkeypatch.setattr(first_start, "_TOLD_EVERY_S", 0.01)
@@ -93,5 +94,5 @@ def test_progress_is_told_while_functions_are_compiled(monkeypatch, capsys):
         telling.cancel()
 
     asyncio.run(scenario())
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = caplog.messages
     assert "7 functions" in line
