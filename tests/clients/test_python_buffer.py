@@ -101,7 +101,7 @@ def test_without_jitter_and_drift_nothing_is_lost_and_nothing_runs_dry():
     assert np.abs(np.diff(heard, 2)).max() < 1.05 * 0.5 * (2 * np.pi * 440 * (1 + MOST_CHANGE) / RATE) ** 2
 
 
-@pytest.mark.parametrize("drift", [-500e-6, 500e-6])
+@pytest.mark.parametrize("drift", [pytest.param(-500e-6, marks=pytest.mark.long), 500e-6])
 def test_clocks_that_drift_apart_cost_nothing_and_the_delay_stays(drift):
     """In a minute and a half they drift apart by 45 ms, which is more than waits."""
     played = Played(90, drift=drift, jitter_s=0.01, ahead=4, frames=1_024)
@@ -129,7 +129,7 @@ def test_a_buffer_that_ran_dry_keeps_more_from_then_on():
     assert played.underruns[-1] == played.underruns[len(played.underruns) // 2]
 
 
-@pytest.mark.parametrize("output_rate", [44_100, 48_000])
+@pytest.mark.parametrize("output_rate", [44_100, pytest.param(48_000, marks=pytest.mark.long)])
 def test_a_sound_card_may_have_another_rate(output_rate):
     played = Played(3, output_rate=output_rate)
     assert played.buffer.underruns == 0

@@ -57,7 +57,7 @@ def test_a_clip_is_heard_from_its_start_and_no_block_is_missing(served):
     assert loudness(blocks[len(before) :]) > 1e-3
 
 
-@pytest.mark.parametrize("encoding", ["f32", "s16"])
+@pytest.mark.parametrize("encoding", [pytest.param("f32", marks=pytest.mark.long), "s16"])
 def test_what_is_written_to_a_live_emitter_comes_back(served, encoding):
     async def perform():
         async with connect(served, encoding=encoding) as stream:

@@ -121,7 +121,7 @@ def served_directional(hrtfs, tmp_path_factory):
         yield address
 
 
-@pytest.mark.parametrize("sample_rate", [24_000, 48_000])
+@pytest.mark.parametrize("sample_rate", [pytest.param(24_000, marks=pytest.mark.long), 48_000])
 def test_two_ears_hear_an_ambisonic_stream_and_turn_at_once(served_directional, sample_rate):
     with connect(served_directional, output="ambisonics", head="kemar", sample_rate=sample_rate) as stream:
         assert (stream.channels, stream.welcome.channels) == (2, 4)
