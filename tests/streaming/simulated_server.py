@@ -333,6 +333,9 @@ class SimulatedSession:
         pose_ids = {"pose_id": self.newest_pose_id, "reverberation_pose_id": self.asked_pose_id}
         return [SimpleNamespace(sequence=sequence, **pose_ids) for sequence in sequences]
 
+    def follow_clock(self) -> list:
+        return []
+
     def complaints(self) -> list:
         return []
 
