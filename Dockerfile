@@ -4,12 +4,21 @@ ARG BASE=python:3.11-slim
 
 FROM ${BASE} AS builder
 WORKDIR /source
+RUN command -v strip || { apt-get update && apt-get install --yes --no-install-recommends binutils; }
 # An environment without pip: the outer pip installs into it, and the image carries no installer.
 RUN python -m venv --without-pip /opt/nafir
 # Dependencies come before the code, so that a change of code reuses their layer.
 # `make lock` writes the file of exact versions and of digests that each download has to have.
 COPY requirements.lock ./
-RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --require-hashes --requirement requirements.lock
+# What no server runs is left out: tests, sources and headers for compilers, symbols for debuggers, ONNX Runtime's tools and
+# its second copy for C. Libraries in `*.libs` were patched by their packagers, and stripping would break them.
+RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --require-hashes --requirement requirements.lock \
+    && cd /opt/nafir/lib/python3*/site-packages \
+    && find . -type d -name tests -prune -exec rm -rf {} + \
+    && find . \( -name '*.pyi' -o -name '*.p[xy][dx]' -o -name '*.[ahcf]' -o -name '*.hpp' \) -delete \
+    && rm -rf onnxruntime/transformers onnxruntime/tools onnxruntime/quantization onnxruntime/datasets onnxruntime/backend \
+    && rm -f onnxruntime/capi/libonnxruntime.so* \
+    && find . -name '*.so*' -not -path './*.libs/*' -exec strip --strip-unneeded {} +
 COPY LICENSE README.md pyproject.toml ./
 COPY server server
 # Without `training` beside it the package is the server alone, so its other command goes.
@@ -19,27 +28,37 @@ RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-dep
 # container compiles at its start, a matter of half a minute, and keeps that where NUMBA_CACHE_DIR says.
 WORKDIR /
 RUN /opt/nafir/bin/python -c "from server.rendering.warm_up import warm_up; warm_up([256])" \
-    && /opt/nafir/bin/nafir ir apartment --listener 1,2,1.5 --emitter 6,3,1.5 -o /tmp/ir.wav && rm /tmp/ir.wav \
-    && /opt/nafir/bin/nafir bench field --rounds 1 --poses 2
-WORKDIR /source
+    && for scene in /opt/nafir/lib/python3*/site-packages/server/scene/bundles/*/; do \
+        /opt/nafir/bin/python -m server.api.first_start "$scene" || exit 1; \
+    done
 
-FROM ${BASE}
+# The base with the library for streams in Opus, which are refused without it, and without what serves only to install and
+# to read about it.
+FROM ${BASE} AS base
+RUN apt-get update && apt-get install --yes --no-install-recommends libopus0
+RUN rm -rf /usr/share/doc /usr/share/man /usr/share/info /usr/share/locale /usr/share/perl* /usr/share/bash-completion /usr/share/python-wheels \
+        /usr/lib/*/perl* /usr/lib/*/gconv /usr/lib/apt /usr/bin/perl* /var/cache /var/lib/apt /var/log \
+    && for library in /usr/lib/python3* /usr/local/lib/python3*; do \
+        cd "$library" 2>/dev/null \
+        && rm -rf test idlelib lib2to3 ensurepip tkinter turtledemo pydoc_data site-packages/pip* dist-packages/pip* dist-packages/setuptools*; \
+    done; \
+    find / -xdev -name __pycache__ -type d -prune -exec rm -rf {} +
+
+FROM scratch
 LABEL org.opencontainers.image.title="Nafir" \
       org.opencontainers.image.description="A real-time neural acoustic field renderer" \
       org.opencontainers.image.licenses="MIT"
-# For streams in Opus; without it they are refused.
-RUN apt-get update \
-    && apt-get install -y --no-install-recommends libopus0 \
-    && rm -rf /var/lib/apt/lists/*
+COPY --from=base / /
 COPY --from=builder /opt/nafir /opt/nafir
-ENV PATH=/opt/nafir/bin:$PATH \
+ENV PATH=/opt/nafir/bin:/usr/local/bin:/usr/bin:/bin \
+    LANG=C.UTF-8 \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
     NAFIR_HOST=0.0.0.0 \
     NAFIR_PORT=8000
 USER 10001:10001
 EXPOSE 8000
-# The slim image has no curl. http.client, unlike urllib, takes no notice of a proxy in the environment.
+# The image has no curl. http.client, unlike urllib, takes no notice of a proxy in the environment.
 HEALTHCHECK --interval=15s --timeout=5s --start-period=60s --retries=3 \
     CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['NAFIR_PORT']), timeout=4); c.request('GET', '/readyz'); sys.exit(c.getresponse().status != 200)"]
 ENTRYPOINT ["nafir"]

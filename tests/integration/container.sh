@@ -5,10 +5,10 @@
 #   sudo make container-test
 #
 # The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
-# Debian with Python 3.11, tagged with the Dockerfile's name for it in an image store of this script's own, which is
-# deleted at the end. podman and runc then run the image with a read-only root; the script waits for /readyz, looks
-# at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks through the scene
-# over WebSocket.
+# Debian with its Python 3.13 (the 3.11 of the release before is too old for requirements.lock), in an image store of this
+# script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
+# for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
+# through the scene over WebSocket.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback
@@ -16,7 +16,7 @@
 #   QUERY=...            query of the impulse-response request
 #   CONTEXT=.            folder with the Dockerfile
 #   STATE=FOLDER         keep the image store and the base system here and use them again next time
-#   BASE_IMAGE=python:3.11-slim   DEBIAN_SUITE=bookworm   DEBIAN_MIRROR=URL
+#   BASE_IMAGE=python:3.13-slim   DEBIAN_SUITE=trixie   DEBIAN_MIRROR=URL
 #   PULL_BASE=1          take BASE_IMAGE from its registry, not from mmdebstrap
 #   BUILD_MOUNTS="/a /b" host folders that pip needs during the build (local wheels, say), mounted read-only
 #   CA_BUNDLE=FILE       certificates for the build; the host's own by default
@@ -24,7 +24,7 @@ set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 context=${CONTEXT:-$root}
-base=${BASE_IMAGE:-python:3.11-slim}
+base=${BASE_IMAGE:-python:3.13-slim}
 image=nafir:container-test
 container=nafir-container-test
 port=${PORT:-8000}
@@ -67,7 +67,7 @@ elif ! run_podman image exists "localhost/$base"; then
         command -v mmdebstrap >/dev/null || fail "mmdebstrap is not installed"
         mmdebstrap --quiet --format=tar --variant=minbase \
             --include=ca-certificates,python-is-python3,python3,python3-pip,python3-venv \
-            "${DEBIAN_SUITE:-bookworm}" "$state/base.tar.part" ${DEBIAN_MIRROR:+"$DEBIAN_MIRROR"}
+            "${DEBIAN_SUITE:-trixie}" "$state/base.tar.part" ${DEBIAN_MIRROR:+"$DEBIAN_MIRROR"}
         mv "$state/base.tar.part" "$state/base.tar"
     fi
     run_podman import --quiet "$state/base.tar" "localhost/$base"
@@ -103,7 +103,7 @@ started=$SECONDS
 run_podman run --detach --name "$container" --no-healthcheck --network host --read-only --read-only-tmpfs=false \
     --cap-drop all --security-opt no-new-privileges \
     --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 \
-    --env NAFIR_HOST=127.0.0.1 --env "NAFIR_PORT=$port" "$image" >/dev/null
+    --env NAFIR_HOST=127.0.0.1 --env "NAFIR_PORT=$port" --env NAFIR_MAX_CONNECTIONS=512 "$image" >/dev/null
 until curl --silent --fail --output /dev/null "$url/readyz"; do
     [ "$(run_podman inspect "$container" --format '{{.State.Running}}')" = true ] ||
         { run_podman logs "$container"; fail "the server stopped"; }
