@@ -17,9 +17,10 @@ from server.field.fields_by_level import FieldsByLevel
 
 
 @contextmanager
-def serving(levels: FieldsByLevel, hrtfs: HrtfLibrary) -> Iterator[str]:
-    """Makes HOST:PORT of a server of a scene's levels, ready, with the options of `nafir serve`."""
-    app = create_app(settings := Settings(port=0), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
+def serving(levels: FieldsByLevel, hrtfs: HrtfLibrary, **options: object) -> Iterator[str]:
+    """Makes HOST:PORT of a server of a scene's levels, ready, with the options of `nafir serve`; `options` are
+    settings."""
+    app = create_app(settings := Settings(port=0, **options), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
     thread = threading.Thread(target=server.run)
     thread.start()

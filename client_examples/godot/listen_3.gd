@@ -20,6 +20,7 @@ func _initialize():
 	_listener.url = _given.get("url", _listener.url)
 	_listener.scene = _given.scene
 	_listener.key = _given.get("key", "")
+	_listener.sample_rate = int(_given.get("rate", "48000"))
 	_listener.translation = Vector3(2, 1.5, -2.5)
 	_listener.rotation = Vector3(0, -PI / 2, 0) # to the right, which is east
 	_source.translation = Vector3(6, 1.5, -3)

@@ -20,6 +20,7 @@ const MOST_CORRECTION = 0.002 # three cents
 const SMOOTHING_S = 1.0
 
 var scene = "apartment"
+var wanted_rate = 0 # 44100, 48000 or 96000; 0 takes the scene's own
 var block_size = 256
 var buffer_blocks = 8
 var target_s = 0.08 # held back against a network that stalls, and a game that draws slowly
@@ -147,10 +148,13 @@ func begin():
 
 # The first message of a connection.
 func hello():
-	return {
+	var message = {
 		"type": "hello", "protocol": PROTOCOL, "scene": scene, "block_size": block_size, "encoding": "s16",
 		"buffer_blocks": buffer_blocks, "listener": _listener,
 	}
+	if wanted_rate > 0:
+		message["sample_rate"] = wanted_rate
+	return message
 
 
 # The connection has ended, or there came none.

@@ -7,6 +7,7 @@ const Core = preload("nafir_core.gd")
 @export var scene := "apartment"
 @export var key := "" ## an API key or token, if the server asks for one
 @export var buffer_s := 0.08
+@export var sample_rate := 48000 ## or 44100 or 96000; 0 takes the scene's own
 @export var origin: Node3D ## the node at the scene's origin; empty if that is the world's
 
 var core = Core.new()
@@ -18,6 +19,7 @@ var _player := AudioStreamPlayer.new()
 
 func _ready() -> void:
 	core.scene = scene
+	core.wanted_rate = sample_rate
 	core.target_s = buffer_s
 	add_child(_player)
 	_open()
