@@ -122,8 +122,9 @@ def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
             if "security" in operation:
                 operation["responses"] |= _described(_NO_KEY)
             for kind, content in operation["responses"].get("200", {}).get("content", {}).items():
-                if kind == "application/json" and path in answer_examples():
-                    content["example"] = answer_examples()[path]
+                route = path if method == "get" else f"{method.upper()} {path}"
+                if kind == "application/json" and route in answer_examples():
+                    content["example"] = answer_examples()[route]
             if path.endswith(_RANGED):
                 operation["responses"] |= _PART
             if path.endswith(_TAGGED):

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, Final
 
-from server.api.catalogue import describe_scene
+from server.api.catalogue import describe_encodings, describe_scene
 from server.api.frontier import Frontier
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.field.fields_by_level import FieldsByLevel
@@ -16,6 +16,7 @@ from server.scene.effects import EffectName
 SCENE: Final = "open-field"
 PARAMETERS: Final[dict[str, Any]] = {
     "scene": SCENE,
+    "clip": "trumpet",
     "listener": "0,0,1.5",
     "emitter": "4,2,1.5",
     "yaw_deg": 90,
@@ -48,10 +49,11 @@ def parameter_example(name: str, schema: Mapping[str, Any]) -> Any:
 
 @cache
 def answer_examples() -> dict[str, Any]:
-    """An answer in JSON by the path of its route. Arrays of samples are cut short."""
+    """An answer in JSON by its route: the path, after a method other than GET. Arrays of samples are cut short."""
     levels = FieldsByLevel.load(Bundle.load(BUNDLED / SCENE))
     scene = describe_scene(levels).model_dump(mode="json")
     plan = PlanDocument.of(SCENE, PlanQuery().plan(levels.default, {})).model_dump(mode="json")
+    clip = {"name": "trumpet", "title": "Trumpet", "duration_s": 8.5, "credit": "its player", "expires_at": None}
     return {
         "/livez": {"status": "live"},
         "/readyz": {"status": "ready"},
@@ -81,9 +83,10 @@ def answer_examples() -> dict[str, Any]:
             "scene": SCENE,
             "files": [{"name": "scene.json", "bytes": 870, "sha256": levels.bundle.digest}],
         },
-        "/v1/clips": {
-            "clips": [{"name": "trumpet", "title": "Trumpet", "duration_s": 8.5, "credit": "its player, CC0"}],
-        },
+        "/v1/clips": {"clips": [clip]},
+        "/v1/clips/{clip}": clip,
+        "POST /v1/clips": {**clip, "expires_at": "2026-01-31T12:00:00Z"},
+        "/v1/encodings": {"encodings": describe_encodings()},
         "/v1/hrtfs": {"default": DEFAULT_HRTF, "hrtfs": [DEFAULT_HRTF]},
         "/v1/hrtfs/{hrtf}/decoder": {
             "hrtf": DEFAULT_HRTF,

@@ -306,7 +306,7 @@ def test_the_schema_of_bundles_is_published(shared_client):
     assert answer.json() == manifest_schema()
 
 
-@pytest.mark.parametrize("path", answer_examples())
+@pytest.mark.parametrize("path", [path for path in answer_examples() if path.startswith("/")])
 def test_examples_of_answers_have_what_answers_have(shared_client, path):
     """Of the same keys, at every depth: items of lists are compared by their first."""
 
@@ -318,7 +318,7 @@ def test_examples_of_answers_have_what_answers_have(shared_client, path):
     params = {"listener": PLACES["listener"], "emitter": PLACES["emitter"], "format": "json", "sample_rate": 24_000}
     operation = shared_client.get("/openapi.json").json()["paths"][path]["get"]
     wanted = {each["name"] for each in operation.get("parameters", ()) if each.get("in") == "query"}
-    asked = path.replace("{scene}", "flat").replace("{hrtf}", "kemar")
+    asked = path.replace("{scene}", "flat").replace("{hrtf}", "kemar").replace("{clip}", "trumpet")
     answer = shared_client.get(asked, params={name: text for name, text in params.items() if name in wanted}).json()
     example = operation["responses"]["200"]["content"]["application/json"]["example"]
     assert example == json.loads(json.dumps(answer_examples()[path]))
@@ -332,7 +332,7 @@ def test_every_parameter_and_json_answer_has_an_example(shared_client):
         for operation in operations.values():
             for each in operation.get("parameters", ()):
                 assert "example" in each or "examples" in each["schema"], (path, each["name"])
-            content = operation["responses"]["200"]["content"]
+            content = operation["responses"].get("200", {}).get("content", {})
             if path != "/v1/scenes/{scene}/bundle/{file}":
                 assert "example" in content.get("application/json", {"example": ""}), path
 
