@@ -137,8 +137,8 @@ predictions: $(VENV)/installed-training ## what plans predict of effects beside 
 	$(BIN)/python -m training.trials.rooms_tried
 
 # Of this machine's Python, and without naming where packages come from.
-lock: $(VENV)/installed-dev ## take newer versions into requirements.lock, the base install of the image: minutes
-	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --upgrade --generate-hashes --strip-extras \
+lock: $(VENV)/installed-dev ## take newer versions into requirements.lock, what the image installs: minutes
+	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --upgrade --extra jwt --generate-hashes --strip-extras \
 		--no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options \
 		--output-file requirements.lock pyproject.toml
 

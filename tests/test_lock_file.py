@@ -1,4 +1,4 @@
-"""`requirements.lock` has what the image installs: the base install, exact, with digests, and no name of a host."""
+"""`requirements.lock` has what the image installs, exact, with digests, and no name of a host."""
 
 import re
 import tomllib
@@ -11,7 +11,8 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "requirements.lock").read_text()
-BASE = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+BASE = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["jwt"]]
 ENTRY = re.compile(
     r"^([a-z0-9-]+)==(\S+)(?: ; [^\\\n]+)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.MULTILINE
 )
