@@ -100,11 +100,11 @@ def secrets_in_many_forms():
     ]
 
 
-@pytest.mark.parametrize(("text", "secret"), secrets_in_many_forms())
-def test_keys_and_tokens_are_blotted_out(text, secret):
-    assert secret in text
-    assert secret not in hide(text)
-    assert "***" in hide(text)
+def test_keys_and_tokens_are_blotted_out():
+    for text, secret in secrets_in_many_forms():
+        assert secret in text
+        assert secret not in hide(text), text
+        assert "***" in hide(text)
 
 
 def test_other_text_stays_as_it_is():
