@@ -53,6 +53,7 @@ from server.runtime.priority import DutyCycle, become_background, become_prompt
 from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
 from server.runtime.thread_watch import ThreadWatch
+from server.runtime.traces import begin_traces
 from server.runtime.workers import Workers
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
@@ -95,10 +96,12 @@ def create_app(
     `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already. `peers`
     are the processes of which this is one.
 
-    Raises NafirError for files of keys that cannot be used. Without `scenes` or `hrtfs` they are loaded at start-up,
-    which raises BundleError for a damaged bundle and HrtfError for a damaged HRTF file.
+    Raises NafirError for files of keys that cannot be used, and for traces without the extra `otel`. Without `scenes`
+    or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for a damaged
+    HRTF file.
     """
     drain = Drain(settings.drain_s) if drain is None else drain
+    end_traces = None if settings.traces_url is None else begin_traces(settings.traces_url)
     access = Access.of(settings, own_key=None if peers is None else peers.key)
     if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
         _logger.warning(_OPEN_TO_ALL, settings.host)
@@ -163,6 +166,8 @@ def create_app(
                     task.cancel()
                 await asyncio.to_thread(audio.stop)
                 await asyncio.to_thread(encoders.stop, _ENCODER_STOP_S)
+                if end_traces is not None:
+                    await asyncio.to_thread(end_traces)
                 collect_as_usual()
 
     app = FastAPI(

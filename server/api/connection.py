@@ -96,6 +96,7 @@ from server.runtime.logs import about
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
+from server.runtime.traces import span
 from server.streaming.admission import Admission, Place, Refusal
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
@@ -498,7 +499,8 @@ class Connection:
             place = admitted
         try:
             first_step = steps.index(place.step) if place.step in steps else 0
-            stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)
+            with span("open stream", {"nafir.scene": hello.scene, "nafir.is_resumed": lost is not None}):
+                stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)
             if stream is None or isinstance(stream, Goodbye):
                 return stream
             host.admission.open(place, stream)

@@ -16,6 +16,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.runtime.logs import begin_about
+from server.runtime.traces import span
 
 REQUEST_ID: Final = "X-Request-ID"
 _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -43,7 +44,8 @@ class RequestLog:
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
-        identifier = request_id(Headers(scope=scope))
+        headers = Headers(scope=scope)
+        identifier = request_id(headers)
         begin_about(request_id=identifier)
         scope[REQUEST_ID] = identifier  # for the answer to a request that fails, which is given outside of this
         status, code, is_problem, started_s = None, None, False, self._time_s()
@@ -52,9 +54,9 @@ class RequestLog:
             nonlocal status, code, is_problem
             match message["type"]:
                 case "http.response.start" | "websocket.http.response.start":
-                    headers = MutableHeaders(scope=message)
-                    headers[REQUEST_ID] = identifier
-                    status, is_problem = message["status"], "problem+json" in headers.get("content-type", "")
+                    answered = MutableHeaders(scope=message)
+                    answered[REQUEST_ID] = identifier
+                    status, is_problem = message["status"], "problem+json" in answered.get("content-type", "")
                 case "http.response.body" | "websocket.http.response.body" if is_problem:
                     is_problem, code = False, _code_of(message.get("body", b""))
                 case "websocket.accept":
@@ -65,8 +67,19 @@ class RequestLog:
                     status, code = 403, message.get("reason")
             await send(message)
 
+        method = scope.get("method", "WEBSOCKET")
+        noted = {"http.request.method": method, "nafir.request_id": identifier}
         try:
-            await self._app(scope, receive, send_noted)
+            with span(method, noted, headers=headers) as traced:
+                try:
+                    await self._app(scope, receive, send_noted)
+                finally:
+                    route = getattr(scope.get("route"), "path", None)  # with the names of parameters, not their values
+                    if route is not None:
+                        traced.update_name(f"{method} {route}")
+                        traced.set_attribute("http.route", route)
+                    if status is not None:
+                        traced.set_attribute("http.response.status_code", status)
         except Exception:
             status, code = status or 500, code or "internal_error"
             raise
@@ -75,7 +88,7 @@ class RequestLog:
                 _logger.info(
                     "request",
                     extra={
-                        "method": scope.get("method", "WEBSOCKET"),
+                        "method": method,
                         "path": scope["path"],  # without the query, in which people put keys
                         "status": _CLIENT_CLOSED_REQUEST if status is None else status,
                         **({} if code is None else {"code": code}),

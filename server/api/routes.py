@@ -53,6 +53,7 @@ from server.responses.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_
 from server.responses.response_batch import BATCH_EXAMPLE, BATCH_MEDIA_TYPES, ResponseBatch
 from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
+from server.runtime.traces import span
 from server.scene.bundle import Bundle
 from server.scene.manifest_schema import manifest_schema
 
@@ -594,10 +595,12 @@ async def _cached(request: Request, etag: str, media_type: str, compute: Compute
 async def _computed(request: Request, etag: str, compute: Compute, *, kind: Kind = "single") -> bytes | None:
     """The cached or computed body; None if the client has gone meanwhile."""
     computing = _host(request).responses.get(etag, compute, kind=kind, client=_client(request))
-    try:
-        return await run_until(computing, _disconnected(request))
-    except StoppedError:
-        return None
+    with span("compute", {"nafir.kind": kind}) as traced:
+        try:
+            return await run_until(computing, _disconnected(request))
+        except StoppedError:
+            traced.set_attribute("nafir.client_has_gone", True)
+            return None
 
 
 async def _disconnected(request: Request) -> None:

@@ -102,6 +102,9 @@ class Settings(BaseSettings):
     """How `nafir serve` writes its log to standard error: lines for people, or JSON for programs."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """The least important lines that are written."""
+    traces_url: str | None = None
+    """Where OpenTelemetry traces go, by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces. They need the extra
+    `otel`."""
     bundles: Paths = ()
     """Scene bundles to serve besides those that come with the package."""
     offer_bundles: bool = True
