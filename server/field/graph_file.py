@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from typing import Final
 
 _EXPORTED: Final = """
-    Abs Add ArgMin Atan Cast Clip Concat Cos Div DynamicQuantizeLinear Einsum Expand Floor Gather GatherND Gelu Gemm
-    GreaterOrEqual Identity LeakyRelu Less Log MatMul MatMulInteger Max Min Mul Neg Not Pow Reciprocal ReduceMean
-    ReduceMin ReduceProd ReduceSum Relu Reshape Scan Sin Slice Softmax Split Sqrt Squeeze Sub Transpose Unsqueeze Where
+    Abs Add ArgMin Atan Cast Clip Concat Conv Cos Div DynamicQuantizeLinear Einsum Expand Floor Gather GatherND Gelu
+    Gemm GreaterOrEqual Identity LeakyRelu Less Log MatMul MatMulInteger Max Min Mul Neg Not Pow Reciprocal
+    ReduceLogSumExp ReduceMean ReduceMin ReduceProd ReduceSum Relu Reshape Scan Sin Slice Softmax Split Sqrt Squeeze
+    Sub Transpose Unsqueeze Where
 """
 """What `nafir-train export` writes, of all kinds of fields in all precisions."""
 _RELATIVES: Final = """

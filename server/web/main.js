@@ -32,6 +32,7 @@ const ORDER = 1; // of ambisonic streams
 const NO_FIELD = "none";
 const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
+const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
 const LONGEST_RETRY_MS = 30_000;
 
 const find = (id) => document.getElementById(id);
@@ -463,7 +464,7 @@ class Page {
       if (this.output === "ambisonics") this.head = head;
     } catch (error) {
       if (this.output !== "ambisonics") return; // it is tried again when it is needed
-      if ([0, 503].includes(error.status)) { // the server cannot be reached, or is about to end or to begin
+      if (AWAY.includes(error.code)) {
         await pause(RETRY_MS);
         if (this.output === "ambisonics") this.#listenWithHead();
         return;

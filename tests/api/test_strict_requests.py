@@ -66,10 +66,13 @@ def test_head_answers_what_a_client_has_with_304(client):
 def test_allow_says_what_works_and_nothing_else(client, path, params):
     allowed = client.options(path).headers["allow"].split(", ")
     assert client.options(path).status_code == 204
-    assert sorted(allowed) == ["GET", "HEAD", "OPTIONS"]
+    uploads = ["POST"] if path == "/v1/clips" else []
+    assert sorted(allowed) == ["GET", "HEAD", "OPTIONS", *uploads]
     for method in ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE", "TRACE", "BREW"):
         answer = client.request(method, path, params=params)
-        if method in allowed:
+        if method in uploads:
+            assert answer.json()["code"] == "uploads_off", "this server takes none"
+        elif method in allowed:
             assert answer.status_code in {200, 204}, method
         else:
             check_problem(answer, 405, "method_not_allowed")

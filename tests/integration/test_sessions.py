@@ -41,7 +41,7 @@ def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own(scene, sa
     # Threads that answer HTTP have nothing to do here; all others have.
     own = {name: load for name, load in loads.items() if name.startswith(("nafir-", "MainThread"))}
     idle = {name for name, load in own.items() if load == 0}
-    assert all(name.startswith("nafir-http") for name in idle), idle
+    assert all(name.startswith(("nafir-http", "nafir-encoder")) for name in idle), idle
     for kind in ("nafir-audio", "nafir-ir", "MainThread"):
         assert any(name.startswith(kind) for name in own), kind
     assert 0 < sum(loads.values()) <= case["server_load"] * 1.05

@@ -47,7 +47,8 @@ def needed(operation: dict, scene: dict) -> dict[str, str]:
 def test_every_route_of_the_scene_answers_at_its_defaults(client, scene, chosen):
     described = client.get(f"/v1/scenes/{scene}").json()
     paths = client.get("/openapi.json").json()["paths"]
-    routes = [path for path, operations in paths.items() if "{scene}" in path and "get" in operations]
+    # Files of bundles have tests of their own.
+    routes = [path for path in paths if "{scene}" in path and "{file}" not in path and "get" in paths[path]]
     assert {path.rsplit("/", 1)[-1] for path in routes} >= {
         "{scene}",
         "frontier",
