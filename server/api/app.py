@@ -235,17 +235,23 @@ async def _follow(host: StreamHost, folder: BundleFolder) -> None:
         await asyncio.sleep(host.settings.bundle_folder_s)
         try:
             changes = await run_in_own_thread(folder.look, "nafir-bundles")
-            host.refused_bundles = folder.refused
-            for scene in changes.gone:
-                host.drop(scene)
-                _logger.info("dropped: %s", scene)
-            for scene, levels in changes.loaded.items():
-                _offer(host, await run_in_own_thread(partial(_prepared, host, levels), "nafir-bundles"))
-                _logger.info("loaded: %s, from %s", scene, levels.bundle.folder)
-            if changes:
-                await _prepare_the_rest(host)
         except Exception:  # the scenes that there are go on
-            _logger.exception("a change of the folder of bundles could not be followed")
+            _logger.exception("the folder of bundles could not be looked at")
+            continue
+        for scene in changes.gone:
+            host.drop(scene)
+            _logger.info("dropped: %s", scene)
+        for scene, levels in changes.loaded.items():
+            try:
+                _offer(host, await run_in_own_thread(partial(_prepared, host, levels), "nafir-bundles"))
+            except Exception:  # its field computes nothing of use; other scenes go on, and so does the one in its place
+                folder.refuse(levels.bundle.folder)
+                _logger.exception("bundle left out: %s", levels.bundle.folder)
+            else:
+                _logger.info("loaded: %s, from %s", scene, levels.bundle.folder)
+        host.refused_bundles = folder.refused
+        if changes:
+            await _prepare_the_rest(host)
 
 
 async def _prepare_the_rest(host: StreamHost) -> None:

@@ -56,7 +56,7 @@ class BundleFolder:
 
     @property
     def refused(self) -> int:
-        """Number of bundles that could not be loaded as they are now."""
+        """Number of bundles that cannot be served as they are now."""
         return sum(known.is_refused for known in self._known.values())
 
     def look(self, *, is_first: bool = False) -> Changes:
@@ -81,6 +81,11 @@ class BundleFolder:
         gone = before - self._served
         restored = {scene: self._others[scene] for scene in gone & self._others.keys()}
         return Changes(restored | loaded, frozenset(gone - self._others.keys()))
+
+    def refuse(self, path: Path) -> None:
+        """Count the bundle of a sub-folder as one that cannot be served as it is now."""
+        if (known := self._known.get(path)) is not None:
+            known.is_refused = True
 
     @property
     def _served(self) -> set[str]:

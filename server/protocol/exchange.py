@@ -100,6 +100,22 @@ _STUDIO: Final = SceneDescription(
 )
 _TWO_FRAMES: Final = np.array([[0.5, 0.25], [-0.25, 0.0]], np.float32)
 
+_WELCOME = Welcome(
+    session="c1d6a2c0b3f94c0c8f0f3d3a6f0f7a55",
+    scene=_STUDIO,
+    sample_rate=48_000,
+    block_size=256,
+    channels=2,
+    encoding="f32",
+    buffer_blocks=8,
+    window=40,
+    ir_samples=24_000,
+    hrtf="kemar",
+    level="fine",
+    max_emitters=16,
+    resume_token="4qVh3mXv0y8Jc1tYb2Rk9wLs6dZf7GpA",
+    resume_s=15.0,
+)
 EXCHANGE: Final[tuple[Step, ...]] = (
     Step(
         "asks for a scene, and says where the listener stands",
@@ -113,22 +129,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     ),
     Step(
         "says what the stream is like; sound begins to flow",
-        Welcome(
-            session="c1d6a2c0b3f94c0c8f0f3d3a6f0f7a55",
-            scene=_STUDIO,
-            sample_rate=48_000,
-            block_size=256,
-            channels=2,
-            encoding="f32",
-            buffer_blocks=8,
-            window=40,
-            ir_samples=24_000,
-            hrtf="kemar",
-            level="fine",
-            max_emitters=16,
-            resume_token="4qVh3mXv0y8Jc1tYb2Rk9wLs6dZf7GpA",
-            resume_s=15.0,
-        ),
+        _WELCOME,
     ),
     Step(
         "adds an emitter that plays a clip",
@@ -238,22 +239,12 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     ),
     Step(
         "goes on where the sound would be by now",
-        Welcome(
-            session="c1d6a2c0b3f94c0c8f0f3d3a6f0f7a55",
-            scene=_STUDIO,
-            sample_rate=48_000,
-            block_size=256,
-            channels=2,
-            encoding="f32",
-            buffer_blocks=8,
-            window=40,
-            ir_samples=24_000,
-            hrtf="kemar",
-            level="fast",
-            max_emitters=16,
-            resume_token="Zr5uW8sK2nQe7vBx1cTg4hYj9mPd3LfA",
-            resume_s=15.0,
-            resumed=Resumed(sample_clock=480_256, sequence=565, pose_id=4, handled=6),
+        _WELCOME.model_copy(
+            update={
+                "level": "fast",
+                "resume_token": "Zr5uW8sK2nQe7vBx1cTg4hYj9mPd3LfA",
+                "resumed": Resumed(sample_clock=480_256, sequence=565, pose_id=4, handled=6),
+            }
         ),
     ),
 )

@@ -8,9 +8,11 @@ from contextlib import contextmanager
 import pytest
 from starlette.testclient import TestClient
 
+from server.api import app
 from server.api.app import create_app
 from server.api.bundle_folder import BundleFolder
 from server.api.settings import Settings
+from server.core.errors import FieldError
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello
@@ -149,6 +151,26 @@ def received(socket, kind):
             parsed = parse_server_message(message["text"])
         if isinstance(parsed, kind):
             return parsed
+
+
+@pytest.mark.timed
+def test_a_bundle_whose_field_fails_keeps_no_other_from_coming(bundle, hrtfs, watched, monkeypatch):
+    usual = app._prepared
+
+    def prepared(host, levels):
+        if levels.bundle.id == "bad":
+            raise FieldError("field_failure", "no sound")
+        return usual(host, levels)
+
+    monkeypatch.setattr(app, "_prepared", prepared)
+    with serving(watched, bundle, hrtfs) as client:
+        put(bundle, watched / "a", id="bad")
+        put(bundle, watched / "b", id="good")
+        until(lambda: "good" in names(client))
+        assert "bad" not in names(client)
+        until(lambda: "nafir_bundles_refused 1" in client.get("/metrics").text)
+        put(bundle, watched / "c", id="later")
+        until(lambda: "later" in names(client))
 
 
 @pytest.mark.timed

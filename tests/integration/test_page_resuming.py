@@ -33,7 +33,7 @@ def test_a_stream_goes_on_with_what_was_changed_meanwhile(browser):
             start(page)
         page.wait_for_function(IS_WAITING)
         page.click("#add-source")
-        page.evaluate("nafir.state().emitters.length === 2")
+        assert page.evaluate("nafir.state().emitters.length") == 2
         with passing_on(port, server):
             page.wait_for_function(IS_LIVE, timeout=20_000)
             assert resumptions(server, "resumed") == 1
