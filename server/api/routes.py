@@ -48,8 +48,10 @@ from server.responses.impulse_response import (
     entity_tag,
     parse_format,
     parse_position,
+    require_directions,
 )
 from server.responses.loudness import FINEST_M, MAX_POINTS, loudness_map, usual_spacing_m
+from server.responses.noise_file import noise_file
 from server.responses.response_batch import BATCH_EXAMPLE, BATCH_MEDIA_TYPES, ResponseBatch
 from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
@@ -100,6 +102,7 @@ _BATCH_BODY = {
 }
 _FILE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
 _FILE_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
+_NOISE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
 _SCHEMA_TYPES: dict[str, Any] = {"content": {"application/schema+json": {"schema": {"type": "object"}}}}
 _BYTES = "application/octet-stream"
 _FILE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
@@ -408,6 +411,25 @@ def _offered_bundle(request: Request, scene: str) -> Bundle:
     if not _host(request).settings.offer_bundles:
         raise RequestError("bundle_not_offered", "this server does not give its scene bundles away", status=403)
     return found
+
+
+@api.get("/scenes/{scene}/ambisonic-noises", response_class=Response, responses={200: _NOISE_TYPES})
+async def ambisonic_noises(
+    request: Request,
+    scene: ScenePath,
+    order: Annotated[WholeNumber, Query(**_between(1, HIGHEST_ORDER), description="of the ambisonic channels")] = 1,
+    level: LevelText = None,
+) -> Response:
+    """The frozen noises behind ambisonic responses, one for each channel, as an array (channel, sample) for NumPy: for
+    programs that compute responses themselves. They are the same in every scene of this length and sample rate."""
+    field = _levels(request, scene).choose(level)
+    require_directions(field)
+    return await _cached(
+        request,
+        entity_tag(field, "ambisonic-noises", {"order": order}, "npy"),
+        _BYTES,
+        lambda _: noise_file(field, order),
+    )
 
 
 @api.get("/schemas/bundle", response_class=Response, responses={200: _SCHEMA_TYPES})

@@ -148,6 +148,7 @@ def test_a_key_in_the_query_opens_nothing(client, keys):
         ("GET", "/v1/scenes/flat/impulse-response", {"render"}),
         ("GET", "/v1/scenes/flat/loudness", {"render"}),
         ("GET", "/v1/scenes/flat/plan", {"render"}),
+        ("GET", "/v1/scenes/flat/ambisonic-noises", {"render"}),
         ("POST", "/v1/scenes/flat/impulse-responses", {"render"}),
         ("GET", "/v1/clips", {"listen", "upload"}),
         ("POST", "/v1/clips", {"upload"}),

@@ -22,6 +22,7 @@ from server.api.openapi_examples import answer_examples
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
 from server.core.errors import FieldError
+from server.field.ambisonic_noise import even_noises
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.rendering.head_decoder import HeadDecoder
@@ -37,6 +38,7 @@ IR = "/v1/scenes/flat/impulse-response"
 BATCH = "/v1/scenes/flat/impulse-responses"
 POSE = {"listener": [1, 2, 1.5], "emitter": [6, 3, 1.5]}
 DECODER = "/v1/hrtfs/kemar/decoder"
+NOISES = "/v1/scenes/flat/ambisonic-noises"
 PLACES = {"listener": "1,2,1.5", "emitter": "6,3,1.5"}
 HEADINGS_DEG = count(1)
 
@@ -441,6 +443,21 @@ def test_each_decoder_has_its_tag_and_is_sent_once(directional_client):
     np.testing.assert_allclose(np.sum(small**2), np.sum(kemar**2) / 4, rtol=0.01)
 
 
+def test_the_noises_are_those_of_ambisonic_responses(directional_client):
+    codec = directional_client.field.bundle.manifest.codec
+    answers = {order: directional_client.get(NOISES, params={"order": order}) for order in (1, 3)}
+    for order, answer in answers.items():
+        noises = np.load(io.BytesIO(answer.content))
+        assert noises.dtype == np.dtype("<f4")
+        wanted = even_noises(codec.sample_rate, codec.samples, (order + 1) ** 2)
+        np.testing.assert_array_equal(noises, wanted.astype(np.float32))
+    assert directional_client.get(NOISES).content == answers[1].content
+    tag = {"If-None-Match": answers[1].headers["etag"]}
+    again = directional_client.get(NOISES, headers=tag)
+    assert (again.status_code, again.content) == (304, b"")
+    assert directional_client.get(NOISES, params={"order": 3}, headers=tag).status_code == 200
+
+
 @pytest.mark.parametrize(
     ("path", "params", "status", "code", "at_fault"),
     [
@@ -492,6 +509,9 @@ def test_each_decoder_has_its_tag_and_is_sent_once(directional_client):
         (DECODER, {"sample_rate": 24_000, "order": "first"}, 422, "malformed_request", "order"),
         (DECODER, {"sample_rate": 24_000, "format": "sofa"}, 422, "unknown_format", "format"),
         (DECODER, {"sample_rate": 24_000, "taps": 8}, 422, "unknown_parameter", "taps"),
+        (NOISES, {}, 409, "no_directions", "output"),
+        (NOISES, {"order": 4}, 422, "malformed_request", "order"),
+        (NOISES, {"level": "finest"}, 404, "unknown_level", "level"),
         ("/v1/nothing", {}, 404, "not_found", None),
         ("/nothing", {}, 404, "not_found", None),
     ],

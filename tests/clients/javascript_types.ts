@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { connect, microphone, RefusedError, type Emitter, type Latency } from "nafir-client";
+import { Field, type Channels } from "nafir-client/field";
 import { bind, poseOf } from "nafir-client/three";
 import { useEmitter, useNafir } from "nafir-client/react";
 
@@ -33,4 +34,13 @@ export function Hook(): string {
   const emitter = useEmitter(nafir, { clip: "trumpet", position: [1, 2, 3] });
   void start();
   return error instanceof RefusedError ? `${error.code}` : `${state} ${emitter?.id} ${poseOf(new THREE.Object3D()).position[0]}`;
+}
+
+export async function compute(): Promise<Float32Array> {
+  const field = await Field.load("https://sound.example", "apartment", { level: "directional-bands", key: null });
+  const path = field.directPath([1, 2, 1.5], [6, 3, 1.5]);
+  const [w]: Channels = field.reflections([1, 2, 1.5], [6, 3, 1.5], path);
+  // @ts-expect-error  a position has three numbers
+  field.response([1, 2], [6, 3, 1.5]);
+  return w;
 }

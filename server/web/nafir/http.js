@@ -8,6 +8,15 @@ export class RequestError extends Error {
   }
 }
 
+/** The address of v1/ of a server, given as its own address or as that of its stream. */
+export function apiOf(url) {
+  const address = new URL(url, globalThis.location?.href);
+  address.protocol = address.protocol.replace(/^ws/, "http");
+  address.pathname = address.pathname.replace(/\/?(v1(\/stream)?\/?)?$/, "/v1/");
+  address.search = address.hash = "";
+  return address;
+}
+
 /** The options of a request, with a key if there is one. */
 export function authorized(options = {}, key = null) {
   return key === null ? options : { ...options, headers: { ...options.headers, Authorization: `Bearer ${key}` } };

@@ -7,7 +7,7 @@
 //
 // Positions are [x, y, z] in metres (x east, y north, z up), orientations quaternions [x, y, z, w] whose identity looks along +x.
 
-import { decoderUrl, fetchJson } from "./http.js";
+import { apiOf, decoderUrl, fetchJson } from "./http.js";
 import { PoseLedger } from "./latency.js";
 import { decodesOpus } from "./opus.js";
 import { Output } from "./output.js";
@@ -27,15 +27,6 @@ export class RefusedError extends Error {
     this.name = "RefusedError";
     this.code = code;
   }
-}
-
-/** The address of v1/ of a server, given as its own address or as that of its stream. */
-function apiOf(url) {
-  const address = new URL(url, globalThis.location?.href);
-  address.protocol = address.protocol.replace(/^ws/, "http");
-  address.pathname = address.pathname.replace(/\/?(v1(\/stream)?\/?)?$/, "/v1/");
-  address.search = address.hash = "";
-  return address;
 }
 
 /** A place with a direction, whose changes are sent. */

@@ -1,0 +1,203 @@
+// A trained field of a scene, in this browser: from the bundle of a server, it computes impulse responses as first-order ambisonics (ACN
+// order, SN3D norm), the samples of the server's own `impulse-response?output=ambisonics`.
+//
+//   const field = await Field.load("https://sound.example", "apartment");
+//   const [w, y, z, x] = field.response([2.2, 2, 1.6], [6.2, 3.2, 1.5]);
+//
+// A response takes some milliseconds: call it in a worker (field_worker.js), and never in an AudioWorklet. Positions are [x, y, z] in metres,
+// orientations quaternions [x, y, z, w].
+
+import { rotation } from "../ambisonics.js";
+import { apiOf, authorized, fetchJson, RequestError } from "../http.js";
+import { BandNoises } from "./band_noises.js";
+import { FloorPlan, OCTAVE_BANDS_HZ } from "./floor_plan.js";
+import { Gate } from "./gate.js";
+import { Network } from "./network.js";
+import { absorptionDbPerM, PlaneWaves } from "./plane_waves.js";
+
+const EAR_AHEAD_S = 0.00026; // sound reaches the nearer ear at most this much before the middle of the head
+const LEAST_POWER = 1e-10;
+const ORDER = 1;
+const CHANNELS = (ORDER + 1) ** 2;
+const AIR_IMPEDANCE = 1.204 * 343;
+const FIELD_INCIDENCE_DB = 5.5;
+
+/** [band] dB that a wall of so many kg/m2 takes from sound that goes through it (server/acoustics/transmission.py). */
+const wallLossDb = (mass) =>
+  OCTAVE_BANDS_HZ.map((hz) => Math.max(0, 10 * Math.log10(1 + ((Math.PI * hz * mass) / AIR_IMPEDANCE) ** 2) - FIELD_INCIDENCE_DB));
+
+const mirrorDb = ({ absorption, scattering }) =>
+  absorption.map((absorbed, band) => 10 * Math.log10(Math.max(LEAST_POWER, (1 - absorbed) * (1 - scattering[band]))));
+
+function planOf({ geometry, bounds: { minimum, maximum } }) {
+  if (geometry) return new FloorPlan({ corners: geometry.corners, height: geometry.height_m });
+  const [[west, south, floor], [east, north, height]] = [minimum, maximum];
+  return new FloorPlan({ corners: [[west, south], [east, south], [east, north], [west, north]], height, floor });
+}
+
+/** The level of this name, or the first whose field knows directions. Throws Error if there is none. */
+function levelOf({ id, levels, fields, direct_sound: directSound }, name) {
+  const knows = ({ field }) => fields[field]?.predicts === "directions" || (field === "none" && directSound !== "field");
+  const found = name === undefined ? levels.find(knows) : levels.find((level) => level.name === name);
+  if (!found) throw new Error(name === undefined ? `scene ${id} has no field that knows directions` : `scene ${id} has no level ${name}`);
+  if (!knows(found)) throw new Error(`level ${found.name} of scene ${id} does not know from where sound arrives`);
+  return found;
+}
+
+async function fetchBytes(url, { key, signal }) {
+  let response;
+  try {
+    response = await fetch(url, authorized({ signal }, key));
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new RequestError("The server cannot be reached.");
+  }
+  if (!response.ok) {
+    const problem = await response.json().catch(() => ({}));
+    throw new RequestError(problem.detail || `The server answered ${response.status}.`, { code: problem.code, status: response.status });
+  }
+  return new Uint8Array(await response.arrayBuffer());
+}
+
+/** The rows of a NumPy file of float32. */
+export function readRows(bytes) {
+  const header = new DataView(bytes.buffer, bytes.byteOffset);
+  const start = 10 + header.getUint16(8, true);
+  const [, rows, columns] = /'shape': \((\d+), (\d+)\)/.exec(new TextDecoder().decode(bytes.subarray(10, start))) ?? [];
+  if (bytes.length !== start + 4 * rows * columns) throw new Error("the noises are damaged");
+  const samples = new Float32Array(bytes.slice(start).buffer);
+  return Array.from({ length: Number(rows) }, (_, row) => samples.subarray(row * columns, (row + 1) * columns));
+}
+
+export class Field {
+  #manifest;
+  #plan;
+  #network = null;
+  #parameters;
+  #reverberation = null;
+  #gate = null;
+  #waves;
+  #mirrorsDb = null;
+  #wallLossDb = null;
+  #knownHarmonics = 0;
+
+  /**
+   * Fetches what a field needs from a server, with the address of it or of its v1/: the manifest, one graph, and the noises. Throws
+   * RequestError where the server refuses, and Error for a scene that cannot be computed here.
+   */
+  static async load(server, scene, { level, key = null, signal } = {}) {
+    const at = new URL(`scenes/${encodeURIComponent(scene)}/`, apiOf(server));
+    const manifest = await fetchJson(new URL("bundle/scene.json", at), { key, signal });
+    const { name, field } = levelOf(manifest, level);
+    if (field === "none") return new Field({ manifest, level });
+    const noisesUrl = new URL(`ambisonic-noises?order=${ORDER}&level=${encodeURIComponent(name)}`, at);
+    const [graph, noises] = await Promise.all([
+      fetchBytes(new URL(`bundle/${encodeURIComponent(manifest.fields[field].file)}`, at), { key, signal }),
+      fetchBytes(noisesUrl, { key, signal }),
+    ]);
+    return new Field({ manifest, level, graph, noises: readRows(noises) });
+  }
+
+  /** `manifest` is scene.json, `graph` (Uint8Array) the ONNX file of the level's field, `noises` the rows of GET ambisonic-noises. */
+  constructor({ manifest, level: name, graph = null, noises = null }) {
+    const level = levelOf(manifest, name);
+    const file = manifest.fields[level.field];
+    const { speed_of_sound: speedOfSound = 343, image_order: imageOrder = 0 } = manifest;
+    this.#manifest = manifest;
+    this.level = level.name;
+    this.#plan = planOf(manifest);
+    this.#parameters = file?.codec ?? manifest.codec;
+    this.speedOfSound = speedOfSound;
+    this.sampleRate = this.#parameters.sample_rate;
+    /** Samples of a response. */
+    this.samples = manifest.codec.samples;
+    this.#waves = new PlaneWaves({ sampleRate: this.sampleRate, speedOfSound, airDbPerM: absorptionDbPerM(manifest.air) });
+    if (imageOrder > 0) {
+      const { walls, floor, ceiling } = manifest.geometry.materials;
+      this.#mirrorsDb = { walls: mirrorDb(walls), floor: mirrorDb(floor), ceiling: mirrorDb(ceiling) };
+      const mass = walls.surface_mass_kg_m2 ?? null;
+      if (manifest.transmission && mass !== null) this.#wallLossDb = wallLossDb(mass);
+    }
+    if (!file) return;
+    if (this.sampleRate !== manifest.codec.sample_rate) throw new Error(`level ${level.name} has a sample rate of its own`);
+    this.#network = new Network(graph);
+    const known = level.order === null || level.order === undefined ? file.order : Math.min(level.order, file.order);
+    this.#knownHarmonics = (known + 1) ** 2 - 1;
+    this.#reverberation = new BandNoises(this.#parameters, noises.slice(0, CHANNELS), level.frames ?? null);
+    this.#gate = new Gate(this.#parameters, { hasFirstReflections: imageOrder > 0 });
+  }
+
+  /** Throws RangeError for a position that is not inside the scene. */
+  requireInside(position, name) {
+    const { minimum, maximum } = this.#manifest.bounds;
+    const isInBox = position.every((at, axis) => minimum[axis] <= at && at <= maximum[axis]);
+    if (position.length === 3 && isInBox && this.#plan.contains(position)) return;
+    throw new RangeError(`${name} (${position.join(", ")}) is not inside scene ${this.#manifest.id}`);
+  }
+
+  /** The direct sound: {lengthM, arrival, gainDb}, the length of its path, the direction from the listener, and gains of edges per band. */
+  directPath(listener, emitter) {
+    return this.#plan.path(listener, emitter, this.speedOfSound);
+  }
+
+  /** The whole response, [W, Y, Z, X] in the axes of a head with this orientation (default: the world's). Throws RangeError as `requireInside`. */
+  response(listener, emitter, orientation = null) {
+    const path = this.directPath(listener, emitter);
+    const channels = this.reflections(listener, emitter, path);
+    this.#waves.add(path, channels);
+    if (orientation) turn(channels, rotation(orientation, ORDER));
+    return channels;
+  }
+
+  /** The response without the direct sound, in world axes: what a room answers. */
+  reflections(listener, emitter, path = this.directPath(listener, emitter)) {
+    this.requireInside(listener, "listener");
+    this.requireInside(emitter, "emitter");
+    const channels = this.#network ? this.#late(listener, emitter, path) : Array.from({ length: CHANNELS }, () => new Float32Array(this.samples));
+    if (this.#mirrorsDb) {
+      for (const { lengthM, arrival, surface } of this.#plan.reflections(listener, emitter)) {
+        this.#waves.add({ lengthM, arrival, gainDb: this.#mirrorsDb[surface] }, channels);
+      }
+    }
+    if (this.#wallLossDb) this.#addThroughWalls(listener, emitter, channels);
+    return channels;
+  }
+
+  /** The filter of the direct sound: minimum phase, with its gain by distance. */
+  directFilter(path) {
+    return this.#waves.filter(path);
+  }
+
+  #late(listener, emitter, path) {
+    const row = (values) => ({ dims: [1, values.length], data: Float32Array.from(values) });
+    const { log_magnitude: levels, directions } = this.#network.run({ listener: row(listener), emitter: row(emitter), path: row(path.described) });
+    const { columns } = this.#reverberation;
+    if (levels.data.length !== OCTAVE_BANDS_HZ.length * columns) throw new Error("the graph does not fit the manifest");
+    const lead = this.#parameters.lead_samples;
+    const aligned = (path.lengthM / this.speedOfSound) * this.sampleRate - lead;
+    if (!Number.isFinite(aligned)) throw new RangeError("no way leads from emitter to listener");
+    const harmonics = directions?.data.subarray(0, this.#knownHarmonics * levels.data.length) ?? new Float32Array(0);
+    const channels = this.#reverberation.decode({ logMagnitude: levels.data, directions: harmonics }, aligned, this.samples);
+    const echoS = this.#plan.firstEchoM(listener, emitter) / this.speedOfSound;
+    this.#gate.open(channels, Math.floor(aligned) + lead, Math.floor((echoS - EAR_AHEAD_S) * this.sampleRate));
+    return channels;
+  }
+
+  #addThroughWalls(listener, emitter, channels) {
+    const walls = this.#plan.wallsBetween(listener, emitter);
+    if (walls === 0) return;
+    const offset = emitter.map((at, axis) => at - listener[axis]);
+    const lengthM = Math.hypot(...offset);
+    const arrival = offset.map((along) => along / lengthM);
+    this.#waves.add({ lengthM, arrival, gainDb: this.#wallLossDb.map((loss) => -walls * loss) }, channels);
+  }
+}
+
+/** Turns channels by the matrix of a rotation, in place. */
+function turn([, ...others], matrix) {
+  const [y, z, x] = others.map((channel) => channel.slice());
+  others.forEach((channel, i) => {
+    const row = CHANNELS * (i + 1);
+    for (let n = 0; n < channel.length; n++) channel[n] = matrix[row + 1] * y[n] + matrix[row + 2] * z[n] + matrix[row + 3] * x[n];
+  });
+}

@@ -1,0 +1,324 @@
+"""The field in the browser, in Node: responses are the server's, and its network computes what ONNX Runtime does."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from server.acoustics.geometry import Quaternion
+from server.acoustics.metrics import parameter_errors
+from server.acoustics.room_parameters import measure
+from server.field.field import AcousticField
+from server.responses.ambisonic_response import AmbisonicResponse
+from server.responses.noise_file import noise_file
+from server.scene.bundle import Bundle, find_bundle, write_bundle
+from tests.clients.test_javascript import HERE, MODULES, NODE
+from tests.directional_flat import FILE, write_directional
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH (Debian: apt-get install nodejs)")
+
+EARLY_S = 0.05
+"""Length of early sound, in which samples have to agree."""
+
+
+@pytest.fixture(scope="module")
+def modules(tmp_path_factory) -> Path:
+    # Node takes files of a folder with a package.json of this type for modules, and those of the server have none.
+    folder = tmp_path_factory.mktemp("modules")
+    shutil.copytree(MODULES, folder, dirs_exist_ok=True)
+    (folder / "package.json").write_text('{"type": "module"}')
+    return folder
+
+
+@pytest.fixture
+def work(modules, tmp_path):
+    """Has the driver do jobs, and returns what it says of each."""
+
+    def do(jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        file = tmp_path / "jobs.json"
+        file.write_text(json.dumps(jobs))
+        command = [NODE, HERE / "javascript_field_driver.mjs", modules, file]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return do
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Responses (pose, channel, sample) of the server and of the browser's modules."""
+
+    field: AcousticField
+    wanted: np.ndarray
+    found: np.ndarray
+
+    def error_db(self, seconds: float | None = None) -> float:
+        """The largest error of a sample, relative to the peak of its response, over all poses."""
+        until = None if seconds is None else round(seconds * self.field.sample_rate)
+        errors = np.abs(self.found - self.wanted)[..., :until].max(axis=(1, 2))
+        return float(20 * np.log10(np.max(errors / np.abs(self.wanted).max(axis=(1, 2)))))
+
+
+@pytest.fixture
+def compare(work, tmp_path):
+    def responses(bundle: Bundle, poses: list[tuple], *, level: str | None = None) -> Compared:
+        field = AcousticField.load(bundle, level=level)
+        listeners, emitters, heads = zip(*poses, strict=True)
+        wanted = AmbisonicResponse(field).impulse_responses(listeners, emitters, np.array(heads), 1)
+        entry = bundle.manifest.fields.get(field.level.field)
+        (tmp_path / "noises.npy").write_bytes(noise_file(field, 1))
+        job = {
+            "task": "respond",
+            "bundle": str(bundle.folder),
+            "graph": None if entry is None else entry.file,
+            "noises": None if entry is None else str(tmp_path / "noises.npy"),
+            "level": level,
+            "poses": [
+                {"listener": list(listener), "emitter": list(emitter), "orientation": list(head)}
+                for listener, emitter, head in poses
+            ],
+            "into": str(tmp_path / "responses.f32"),
+        }
+        [said] = work([job])
+        assert said == {"level": field.level.name, "sampleRate": field.sample_rate, "samples": field.ir_samples}
+        found = np.fromfile(tmp_path / "responses.f32", "<f4").reshape(wanted.shape)
+        return Compared(field, wanted, found)
+
+    return responses
+
+
+def drawn(bundle: Bundle, count: int) -> list[tuple]:
+    """Places all over the scene, and heads in all directions."""
+    rng = np.random.default_rng(count)
+    low, high = np.array(bundle.manifest.bounds.minimum), np.array(bundle.manifest.bounds.maximum)
+    places = (tuple(map(float, rng.uniform(low, high))) for _ in range(100 * count))
+    inside = (place for place in places if bundle.floor_plan.holds(place))
+    return [(next(inside), next(inside), Quaternion(*rng.standard_normal(4))) for _ in range(count)]
+
+
+def test_responses_of_the_flat_are_the_servers(compare):
+    bundle = Bundle.load(find_bundle("apartment"))
+    poses = drawn(bundle, 40)
+    is_hidden = [not bundle.floor_plan.is_visible(listener, emitter) for listener, emitter, _ in poses]
+    assert 5 < sum(is_hidden) < 35  # both by sight and round the corners of the doorway
+    compared = compare(bundle, poses)
+    assert compared.error_db(EARLY_S) < -80
+    assert compared.error_db() < -80
+    # And so are the metrics, far below the floor of what a single response can say.
+    floor = next(level.accuracy.floor for level in bundle.manifest.levels if level.name == compared.field.level.name)
+    wanted, found = (measure(of[:, :1], compared.field.sample_rate) for of in (compared.wanted, compared.found))
+    errors = parameter_errors(wanted, found)
+    for name in ("t60", "edt", "c50", "drr", "level"):
+        assert np.nanmax(errors[name]) < 0.01 * floor[name], name
+
+
+@pytest.mark.parametrize(
+    ("order", "towards"),
+    [(0, None), (1, None), (1, (0.6, 0.0, 0.8)), (2, (1.0, 0.0, 0.0)), (3, (0.0, -0.8, 0.6))],
+)
+def test_directions_of_every_order_become_the_servers_channels(compare, tmp_path, order, towards):
+    bundle = write_directional(tmp_path / "flat", order, towards)
+    assert compare(bundle, drawn(bundle, 4)).error_db() < -80
+
+
+def changed(bundle: Bundle, folder: Path, **changes: Any) -> Bundle:
+    """The bundle with another manifest."""
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    document = bundle.manifest.model_dump() | changes
+    return write_bundle(folder, type(bundle.manifest).model_validate(document), files)
+
+
+def test_a_level_of_few_frames_and_a_low_order_ends_as_the_servers(compare, tmp_path):
+    bundle = write_directional(tmp_path / "flat", 2, (1.0, 0.0, 0.0))
+    [level] = bundle.manifest.levels
+    short = level.model_copy(update={"name": "short", "frames": 30, "order": 1})
+    bundle = changed(bundle, tmp_path / "short", levels=[level.model_dump(), short.model_dump()])
+    poses = drawn(bundle, 4)
+    compared = compare(bundle, poses, level="short")
+    assert compared.error_db() < -80
+    assert np.any(compared.wanted != compare(bundle, poses).wanted)
+
+
+def test_sound_through_walls_is_the_servers(compare, tmp_path):
+    bundle = Bundle.load(find_bundle("apartment"))
+    geometry = bundle.manifest.geometry.model_dump()
+    geometry["materials"]["walls"]["surface_mass_kg_m2"] = 8.0
+    heavy = changed(bundle, tmp_path / "heavy", geometry=geometry, transmission=True)
+    poses = [((2.0, 1.0, 1.5), (6.0, 1.2, 1.4), (0, 0, 0, 1)), ((2.0, 2.5, 1.5), (6.0, 2.5, 1.4), (0, 0, 0, 1))]
+    compared = compare(heavy, poses)
+    assert compared.error_db(EARLY_S) < -80
+    is_another = np.any(
+        compared.wanted
+        != AmbisonicResponse(AcousticField.load(bundle)).impulse_responses(
+            *zip(*[pose[:2] for pose in poses], strict=True), np.zeros(2), 1
+        ),
+        axis=(1, 2),
+    )
+    assert is_another.tolist() == [True, False]  # the doorway lets the other through
+
+
+def test_a_scene_without_a_field_has_direct_sound_alone(compare):
+    bundle = Bundle.load(find_bundle("open-field"))
+    assert (
+        compare(bundle, [((0, 0, 1.5), (4, 2, 1.5), (0, 0, 0, 1)), ((0, 0, 1.5), (0, 0, 1.5), (0, 0, 0, 1))]).error_db()
+        < -80
+    )
+
+
+def operator_cases() -> list[tuple[str, str, dict[str, Any], list[Any], int]]:
+    """(name, operator, attributes, inputs, outputs): float arrays are inputs of the graph, others its constants."""
+    rng = np.random.default_rng(3)
+
+    def real(*dims: int) -> np.ndarray:
+        return rng.standard_normal(dims).astype(np.float32)
+
+    def whole(*values: int) -> np.ndarray:
+        return np.array(values, np.int64)
+
+    x, positive = real(2, 3, 4), np.abs(real(2, 3, 4)) + np.float32(0.1)
+    each = ["Abs", "Cos", "Erf", "Exp", "Floor", "Identity", "LeakyRelu", "Neg", "Relu", "Sigmoid", "Sin", "Tanh"]
+    cases = [(name, name, {}, [x], 1) for name in each]
+    cases += [(name, name, {}, [positive], 1) for name in ("Log", "Reciprocal", "Sqrt")]
+    cases += [(f"{name} broadcast", name, {}, [x, real(3, 1)], 1) for name in ("Add", "Div", "Mul", "Sub")]
+    cases += [(name, name, {}, [x, real(4), real(2, 1, 1)], 1) for name in ("Max", "Min", "Sum")]
+    reductions = ["ReduceL2", "ReduceMean", "ReduceSum", "ReduceSumSquare"]
+    cases += [(f"{name} of one", name, {"keepdims": 0}, [x, whole(-1)], 1) for name in reductions]
+    cases += [(f"{name} of all", name, {}, [x], 1) for name in reductions]
+    return [
+        *cases,
+        ("Cast", "Cast", {"to": TensorProto.FLOAT}, [np.arange(6, dtype=np.float16) / np.float16(7)], 1),
+        ("Clip", "Clip", {}, [x, np.float32(-0.5), np.float32(0.5)], 1),
+        ("Clip below", "Clip", {}, [x, np.float32(-0.5)], 1),
+        ("Concat", "Concat", {"axis": -2}, [x, real(2, 2, 4)], 1),
+        ("Expand", "Expand", {}, [real(3, 1), whole(2, 3, 4)], 1),
+        ("Gather", "Gather", {"axis": 1}, [x, np.array([[2, 0], [-1, 1]])], 1),
+        ("Gelu", "Gelu", {}, [4 * x], 1),
+        ("Gelu by tanh", "Gelu", {"approximate": "tanh"}, [x], 1),
+        ("Gemm", "Gemm", {"alpha": 0.5, "beta": 2.0, "transB": 1}, [real(3, 7), real(5, 7), real(5)], 1),
+        ("Gemm turned", "Gemm", {"transA": 1}, [real(7, 3), real(7, 5)], 1),
+        ("MatMul", "MatMul", {}, [real(2, 1, 3, 7), real(2, 7, 5)], 1),
+        ("MatMul of vectors", "MatMul", {}, [real(7), real(7, 5)], 1),
+        ("Pow", "Pow", {}, [positive, np.float32(1.7)], 1),
+        ("Reshape", "Reshape", {}, [x, whole(0, -1)], 1),
+        ("Slice", "Slice", {}, [x, whole(-3, 1), whole(10, 4), whole(2, 1), whole(2, 1)], 1),
+        ("Softmax", "Softmax", {"axis": 1}, [x], 1),
+        ("Split", "Split", {"axis": 2}, [x, whole(1, 3)], 2),
+        ("Split evenly", "Split", {"axis": 1, "num_outputs": 2}, [x], 2),
+        ("Squeeze", "Squeeze", {}, [real(1, 3, 1), whole(-1)], 1),
+        ("Transpose", "Transpose", {"perm": [2, 0, 1]}, [x], 1),
+        ("Unsqueeze", "Unsqueeze", {}, [x, whole(0, -1)], 1),
+    ]
+
+
+def graph_of(operator: str, attributes: dict[str, Any], inputs: list[Any], outputs: int) -> bytes:
+    """A graph of one node. The first input is given to it, and so are other float arrays; the rest are constants."""
+    arrays = [np.asarray(each) for each in inputs]
+    names = [f"input_{number}" for number in range(len(arrays))]
+    is_given = [each.dtype == np.float32 and each.ndim > 0 for each in arrays]
+    results = [f"output_{number}" for number in range(outputs)]
+    graph = helper.make_graph(
+        [helper.make_node(operator, names, results, **attributes)],
+        "one",
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, each.shape)
+            for name, each, given in zip(names, arrays, is_given, strict=True)
+            if given
+        ],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in results],
+        [
+            numpy_helper.from_array(each, name)
+            for name, each, given in zip(names, arrays, is_given, strict=True)
+            if not given
+        ],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10).SerializeToString()
+
+
+def test_each_operator_computes_what_onnx_runtime_does(work, tmp_path):
+    jobs, wanted = [], []
+    for number, (name, operator, attributes, inputs, outputs) in enumerate(operator_cases()):
+        model = graph_of(operator, attributes, inputs, outputs)
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+        given = {each.name: np.asarray(inputs[int(each.name.removeprefix("input_"))]) for each in session.get_inputs()}
+        wanted.append((name, session.run(None, given)))
+        file = tmp_path / f"{number}.onnx"
+        file.write_bytes(model)
+        tensors = {name: {"dims": list(each.shape), "data": each.ravel().tolist()} for name, each in given.items()}
+        jobs.append({"task": "run", "graph": str(file), "inputs": tensors})
+    for (name, arrays), said in zip(wanted, work(jobs), strict=True):
+        assert "error" not in said, f"{name}: {said}"
+        for number, array in enumerate(arrays):
+            found = said[f"output_{number}"]
+            assert found["dims"] == list(array.shape), name
+            np.testing.assert_allclose(np.array(found["data"]), array.ravel(), rtol=2e-6, atol=2e-6, err_msg=name)
+
+
+def test_every_operator_of_the_network_is_compared(modules):
+    source = (modules / "field" / "network.js").read_text()
+    table = source.split("const OPERATORS = {")[1].split("\n};")[0]
+    known = {line.split(":")[0].strip() for line in table.splitlines() if line.startswith("  ") and line[2].isupper()}
+    assert known - {"Constant"} == {operator for _, operator, *_ in operator_cases()}
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda model: model[: len(model) // 2], "ends within"),
+        (lambda _: b"", "no output"),
+        (lambda _: b"\x80", "no end"),
+        (lambda _: b"\x0f\x00", "no protobuf"),
+    ],
+)
+def test_a_damaged_graph_is_refused_in_words(work, tmp_path, damage, message):
+    bundle = write_directional(tmp_path / "flat")
+    (tmp_path / "damaged.onnx").write_bytes(damage((bundle.folder / FILE).read_bytes()))
+    [said] = work([{"task": "run", "graph": str(tmp_path / "damaged.onnx"), "inputs": {}}])
+    assert message in said["error"]
+
+
+def test_what_cannot_be_computed_here_is_said(work, tmp_path):
+    (tmp_path / "strange.onnx").write_bytes(graph_of("Tan", {}, [np.zeros(3, np.float32)], 1))
+    (tmp_path / "sine.onnx").write_bytes(graph_of("Sin", {}, [np.zeros(3, np.float32)], 1))
+    bundle = Bundle.load(find_bundle("apartment"))
+    (tmp_path / "noises.npy").write_bytes(noise_file(AcousticField.load(bundle), 1))
+    apartment = {
+        "task": "respond",
+        "bundle": str(bundle.folder),
+        "graph": "directional.onnx",
+        "noises": str(tmp_path / "noises.npy"),
+        "into": str(tmp_path / "responses.f32"),
+    }
+    inside = {"listener": [1, 1, 1.5], "emitter": [2, 2, 1.5]}
+    jobs = [
+        {"task": "run", "graph": str(tmp_path / "strange.onnx"), "inputs": {}},
+        {"task": "run", "graph": str(tmp_path / "sine.onnx"), "inputs": {}},
+        {**apartment, "poses": [{**inside, "listener": [4.1, 1.0, 1.5]}]},
+        {**apartment, "poses": [{**inside, "emitter": [1, 1, 2.5]}]},
+        {**apartment, "poses": [inside], "level": "finest"},
+        {**apartment, "poses": [inside], "level": "factorised-r16-100cm-120deg"},
+    ]
+    assert [each["error"] for each in work(jobs)] == [
+        "the graph needs Tan, which a browser's field does not know",
+        "the graph's input input_0 is not given",
+        "listener (4.1, 1, 1.5) is not inside scene apartment",
+        "emitter (1, 1, 2.5) is not inside scene apartment",
+        "scene apartment has no level finest",
+        "level factorised-r16-100cm-120deg of scene apartment does not know from where sound arrives",
+    ]
+
+
+@pytest.mark.parametrize("length", [1, 64, 15, 1200])
+def test_transforms_of_any_length_are_discrete_fourier_transforms(work, length):
+    signal = np.random.default_rng(length).standard_normal((2, length))
+    [said] = work([{"task": "spectrum", "re": signal[0].tolist(), "im": signal[1].tolist()}])
+    wanted = np.fft.fft(signal[0] + 1j * signal[1])
+    np.testing.assert_allclose(np.array(said["there"]), [wanted.real, wanted.imag], atol=1e-10)
+    np.testing.assert_allclose(np.array(said["back"]), signal, atol=1e-13)
