@@ -2,9 +2,11 @@
 
 using System;
 using System.Collections;
+using System.Collections.Concurrent;
 using System.Collections.Generic;
 using System.Diagnostics;
 using System.Globalization;
+using System.IO;
 using System.Linq;
 using System.Reflection;
 using System.Threading;
@@ -49,6 +51,12 @@ static class UnityDriver
                     NafirWire.AddEmitter("npc-ä", new NafirSource { Pose = pose }),
                     NafirWire.MoveEmitter("x", uint.MaxValue, pose), NafirWire.SetGain("x", -6), NafirWire.RemoveEmitter("x"),
                     NafirWire.Acknowledge(uint.MaxValue),
+                    NafirWire.Resume("a\"b", null, null), NafirWire.Resume(null, "c2ln", new NafirBlock { Sequence = 7, SampleClock = 1UL << 40 }),
+                    NafirWire.AddEmitter("shot", new NafirSource { Clip = "trumpet", Pose = pose, Loop = false, StartAt = 5000, StopAt = 100, OffsetS = 0.5f, RemoveWhenEnded = true }, 1000),
+                    NafirWire.AddEmitter("loop", new NafirSource { Clip = "trumpet", Pose = pose, LoopStartS = 0.25f, LoopEndS = 1.5f }),
+                    NafirWire.AddEmitter("voice", new NafirSource { Pose = pose, JitterMs = 40 }),
+                    NafirWire.StopEmitter("x", 5000, 0.5f, 1000), NafirWire.StopEmitter("x", null, 0.01f), NafirWire.SetGain("x", -6, 2.5f),
+                    NafirWire.SetLevel("auto"), NafirWire.Ping(9), NafirWire.Hello("flat", 0, 512, 8, pose, "fine"),
                 });
             case "json":
                 try
@@ -60,6 +68,9 @@ static class UnityDriver
                     return "refused";
                 }
             case "play": return Play(words.Select(each => (double)Number(each)).ToArray());
+            case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]));
+            case "shots": return Shots(words[0], words[1], words[2]);
+            case "microphone": return FromMicrophone(words[0], words[1]);
             case "components": return Components(words[0], words[1]);
             default: throw new ArgumentException(command);
         }
@@ -138,6 +149,102 @@ static class UnityDriver
         var state = camera.Stream.State;
         Call(camera, "OnDisable");
         return $"{state} {Text((float)loudest)} {Text((float)left)} {Text((float)after)} {Text(pose)}";
+    }
+
+    // Plays a stream as a sound card would, for some seconds, and writes what is heard (float32, stereo, 48 kHz) to a file. Says meanwhile
+    // what becomes of it, a line for each event, and how many samples had been heard by then. While
+    // the connection is lost, it adds an emitter.
+    static string Hear(string url, string scene, string clip, double seconds, string path, double giveUpAfterS)
+    {
+        const int Quantum = 480;
+        var pose = NafirPose.FromUnity(new NafirVector(2, 1.5f, 2.5f), new NafirQuaternion(0, 0.70710678f, 0, 0.70710678f));
+        var source = new NafirSource { Clip = clip, Pose = NafirPose.FromUnity(new NafirVector(6, 1.5f, 3), new NafirQuaternion(0, 0, 0, 1)) };
+        using (var stream = new NafirStream(url, scene, 48000, pose, giveUpAfterS: giveUpAfterS))
+        using (var file = new BinaryWriter(File.Create(path)))
+        {
+            int played = 0;
+            stream.StateChanged += state =>
+            {
+                Console.WriteLine($"state {state} {Volatile.Read(ref played)} {stream.Problem}");
+                if (state == NafirState.Waiting) stream.SetEmitter("late", new NafirSource { Clip = clip, Pose = pose, GainDb = -70 });
+            };
+            stream.Received += message => Say(message);
+            stream.SetEmitter("source", source);
+            var ears = new float[2 * Quantum];
+            double fullest = 0;
+            var clock = Stopwatch.StartNew();
+            for (int quantum = 0; quantum * Quantum < seconds * 48000; quantum++)
+            {
+                var earlyMs = 1000.0 * quantum * Quantum / 48000 - clock.Elapsed.TotalMilliseconds;
+                if (earlyMs > 0) Thread.Sleep((int)Math.Ceiling(earlyMs));
+                Array.Clear(ears, 0, ears.Length);
+                stream.AddTo(ears, 2);
+                foreach (var each in ears) file.Write(each);
+                Volatile.Write(ref played, (quantum + 1) * Quantum);
+                if (quantum * Quantum > (seconds - 1) * 48000) fullest = Math.Max(fullest, stream.Statistics.WaitingS);
+                if (stream.State == NafirState.Lost || stream.State == NafirState.Refused) break;
+            }
+            var counts = stream.Statistics;
+            return Invariant($"end {stream.State} {counts.Reconnections} {counts.Resumptions} {counts.Underruns} {fullest:f3} {counts.RoundTripS:f4} {stream.SampleClock} {stream.Level}");
+        }
+    }
+
+    static void Say(Dictionary<string, object> message)
+    {
+        var type = (string)message["type"];
+        if (type != "status" && type != "level_changed" && type != "pong" && type != "plan_changed" && type != "snapshot") Console.WriteLine($"{type} {(type == "error" ? message["code"] : type == "welcome" ? "" : message["id"])}");
+    }
+
+    static string Invariant(FormattableString text) => FormattableString.Invariant(text);
+
+    // Ten one-shots of a clip half a second apart, by the clock. Answers with how many ended, and what was refused.
+    static string Shots(string url, string scene, string clip)
+    {
+        var pose = NafirPose.FromUnity(new NafirVector(2, 1.5f, 2.5f), new NafirQuaternion(0, 0, 0, 1));
+        var ended = new ConcurrentQueue<string>();
+        var refused = new ConcurrentQueue<string>();
+        using (var stream = new NafirStream(url, scene, 48000, pose))
+        {
+            stream.EmitterEnded += ended.Enqueue;
+            stream.EmitterRefused += (id, problem) => refused.Enqueue(problem.Split(':')[0]);
+            while (stream.SampleClock == 0) Thread.Sleep(10);
+            stream.SetEmitter("nothing", new NafirSource { Clip = "no such clip", Pose = pose });
+            var wanted = new List<string>();
+            for (int i = 0; i < 5; i++) wanted.Add(stream.PlayOneShot(clip, pose, -6, stream.SampleClock + (ulong)(i * stream.SampleRate / 10)));
+            stream.SetEmitter("long", new NafirSource { Clip = clip, Pose = pose });
+            stream.SetGain("long", -12, 0.2f);
+            Thread.Sleep(500);
+            foreach (var id in wanted) stream.StopEmitter(id);
+            stream.StopEmitter("long", stream.SampleClock + 4800, 0.05f);
+            for (int i = 0; i < 800 && ended.Count < 6; i++) Thread.Sleep(10);
+            return $"{ended.Count} {string.Join(",", wanted.Except(ended))} {string.Join(",", refused)}";
+        }
+    }
+
+    // A game whose microphone hears a tone. Answers with the loudest that comes back in three seconds.
+    static string FromMicrophone(string url, string scene)
+    {
+        var camera = new NafirClient { url = url, scene = scene };
+        camera.transform.position = new Vector3(2, 1.5f, 2.5f);
+        var thing = new NafirEmitter { client = camera };
+        thing.transform.position = new Vector3(3, 1.5f, 3);
+        var microphone = new NafirMicrophone { beside = thing };
+        foreach (var each in new object[] { camera, thing, microphone }) Call(each, "OnEnable");
+        var heard = new float[2 * 480];
+        double loudest = 0;
+        var clock = Stopwatch.StartNew();
+        for (int quantum = 0; quantum < 300; quantum++)
+        {
+            var earlyMs = 10.0 * quantum - clock.Elapsed.TotalMilliseconds;
+            if (earlyMs > 0) Thread.Sleep((int)Math.Ceiling(earlyMs));
+            for (int i = 0; i < 480; i++) Microphone.Record((float)(0.5 * Math.Sin(2 * Math.PI * 300 * (480 * quantum + i) / 48000)));
+            foreach (var each in new object[] { camera, thing, microphone }) Call(each, "Update");
+            Array.Clear(heard, 0, heard.Length);
+            Call(camera, "OnAudioFilterRead", heard, 2);
+            loudest = Math.Max(loudest, Math.Sqrt(heard.Sum(each => each * each) / heard.Length));
+        }
+        foreach (var each in new object[] { microphone, thing, camera }) Call(each, "OnDisable");
+        return Text((float)loudest);
     }
 
     static void Call(object of, string method, params object[] arguments) =>

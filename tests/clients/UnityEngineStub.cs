@@ -62,6 +62,45 @@ namespace UnityEngine
     public class MonoBehaviour : Object
     {
         public Transform transform = new Transform();
+        public MonoBehaviour beside; // the other component of the object
+
+        public T GetComponent<T>() where T : MonoBehaviour => beside as T;
+    }
+
+    public sealed class AudioClip : Object
+    {
+        public int samples, channels, frequency;
+        public float[] ring;
+
+        public bool GetData(float[] data, int offset)
+        {
+            for (int i = 0; i < data.Length; i++) data[i] = ring[(offset * channels + i) % ring.Length];
+            return true;
+        }
+    }
+
+    // A device that records what `Record` is given.
+    public static class Microphone
+    {
+        static AudioClip clip;
+        static int position;
+
+        public static AudioClip Start(string device, bool loop, int lengthSec, int frequency)
+        {
+            position = 0;
+            return clip = new AudioClip { samples = lengthSec * frequency, channels = 2, frequency = frequency, ring = new float[2 * lengthSec * frequency] };
+        }
+
+        public static void End(string device) => clip = null;
+
+        public static int GetPosition(string device) => position;
+
+        public static void Record(float sample)
+        {
+            clip.ring[2 * position] = sample;
+            clip.ring[2 * position + 1] = -sample;
+            position = (position + 1) % clip.samples;
+        }
     }
 
     public static class AudioSettings
@@ -86,6 +125,12 @@ namespace UnityEngine
     public sealed class RangeAttribute : Attribute
     {
         public RangeAttribute(float least, float most) { }
+    }
+
+    [AttributeUsage(AttributeTargets.Class)]
+    public sealed class RequireComponentAttribute : Attribute
+    {
+        public RequireComponentAttribute(Type type) { }
     }
 
     [AttributeUsage(AttributeTargets.Class)]

@@ -92,7 +92,8 @@ def test_a_damaged_block_is_none(program):
 
 def test_text_messages_are_valid_and_say_what_was_meant(program):
     [line] = answers(program, "texts")
-    hello, other, clip, live, move, gain, remove, acknowledge = map(parse_client_message, line.split("\t"))
+    messages = list(map(parse_client_message, line.split("\t")))
+    hello, other, clip, live, move, gain, remove, acknowledge = messages[:8]
     assert (hello.scene, hello.sample_rate, hello.encoding, hello.buffer_blocks) == ('flat "1"', 24_000, "s16", 4)
     np.testing.assert_allclose(hello.listener.pose.position, (1.5, -2.25, 0.1), rtol=1e-6)
     np.testing.assert_allclose(hello.listener.pose.orientation, (0, 0, 0.6, 0.8), rtol=1e-6)
@@ -101,6 +102,25 @@ def test_text_messages_are_valid_and_say_what_was_meant(program):
     assert (live.id, live.live) == ("npc-ä", True)
     assert move.pose_id == 2**32 - 1
     assert (gain.id, gain.gain_db, remove.id, acknowledge.sequence) == ("x", -6, "x", 2**32 - 1)
+
+
+def test_messages_of_clips_and_of_resuming_are_valid_and_say_what_was_meant(program):
+    [line] = answers(program, "texts")
+    resume, elsewhere, shot, loop, voice, stop, stop_now, ramp, level, ping, hello = map(
+        parse_client_message, line.split("\t")[8:]
+    )
+    assert (resume.token, resume.snapshot, resume.sequence) == ('a"b', None, None)
+    assert (elsewhere.token, elsewhere.snapshot) == (None, "c2ln")
+    assert (elsewhere.sequence, elsewhere.sample_clock) == (7, 2**40)
+    # Clocks of the stream are a thousand ahead of the server's here.
+    assert (shot.start_at, shot.stop_at, shot.offset_s) == (4000, 0, 0.5)
+    assert (shot.loop, shot.remove_when_ended) == (False, True)
+    assert (loop.loop_start_s, loop.loop_end_s, loop.loop) == (0.25, 1.5, True)
+    assert (voice.live, voice.jitter_ms) == (True, 40)
+    assert (stop.stop_at, stop.fade_s, stop_now.stop_at) == (4000, 0.5, None)
+    assert stop_now.fade_s == pytest.approx(0.01)
+    assert (ramp.gain_db, ramp.ramp_s, level.level, ping.id) == (-6, 2.5, "auto", 9)
+    assert (hello.level, hello.snapshots) == ("fine", True)
 
 
 def test_json_is_read_as_python_reads_it(program):
@@ -161,7 +181,7 @@ def run(listen, address, *words):
 @pytest.mark.parametrize("source", ["trumpet", "live"])
 def test_a_real_server_is_heard(listen, served, source):
     code, said, heard = run(listen, served, "flat", source, "2.5")
-    assert (code, said) == (0, "")
+    assert (code, said) == (0, ""), said
     left, right, pose = heard.T
     assert left.max() > 1e-3
     assert right.max() > 1e-3
@@ -203,3 +223,12 @@ def test_the_components_play_in_a_game(program, served):
     assert float(after) < 0.01 * float(heard)
     # The scene's origin stands elsewhere in the game, turned by a quarter.
     np.testing.assert_allclose(np.array(pose, float), [2, 2.5, 1.5, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-5)
+
+
+def test_one_shots_and_what_is_stopped_end_and_a_refusal_is_told(program, served):
+    assert answers(program, f"shots ws://{served}/v1/stream flat trumpet") == ["6  unknown_clip"]
+
+
+def test_a_microphone_is_heard(program, served):
+    [loudest] = answers(program, f"microphone ws://{served}/v1/stream flat")
+    assert float(loudest) > 1e-3

@@ -30,6 +30,10 @@ class LossyProxy:
         """Reset all connections, on both sides."""
         asyncio.run_coroutine_threadsafe(self._cut(), self._loop).result(5)
 
+    def redirect(self, target: str) -> None:
+        """New connections go to another server."""
+        self._target = target.split(":")
+
     def go_dark(self) -> None:
         """From now on nothing passes on the connections that there are, in either direction, and nothing ends them. New
         ones work."""

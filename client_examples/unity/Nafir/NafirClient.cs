@@ -1,3 +1,5 @@
+using System;
+using System.Collections.Concurrent;
 using UnityEngine;
 
 namespace Nafir
@@ -22,16 +24,29 @@ namespace Nafir
         [Tooltip("Seconds of sound that are held back against a network that stalls.")]
         public float buffer = 0.06f;
 
-        NafirState told = NafirState.Connecting;
+        [Tooltip("Seconds for which a server that is gone is tried again.")]
+        public float giveUpAfter = 300;
+
+        readonly ConcurrentQueue<Action> news = new ConcurrentQueue<Action>(); // of the stream's threads, for the game's
         volatile NafirStream stream;
 
         /// <summary>The stream; null while the component is disabled.</summary>
         public NafirStream Stream => stream;
 
+        /// <summary>The stream is live, was lost and is being tried again (`Waiting`), or is over (`Refused`, `Lost`). `Stream.Problem` says
+        /// why. Events are raised in `Update`.</summary>
+        public event Action<NafirState> StateChanged;
+
+        /// <summary>The clip of the emitter with this id is over, with its reverberation.</summary>
+        public event Action<string> EmitterEnded;
+
         void OnEnable()
         {
-            told = NafirState.Connecting;
-            stream = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer, key);
+            var opened = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer, key, giveUpAfterS: giveUpAfter);
+            opened.StateChanged += state => news.Enqueue(() => Tell(state, opened.Problem));
+            opened.EmitterEnded += id => news.Enqueue(() => EmitterEnded?.Invoke(id));
+            opened.EmitterRefused += (id, problem) => news.Enqueue(() => Debug.LogWarning($"Nafir: emitter {id}: {problem}", this));
+            stream = opened;
         }
 
         void OnDisable()
@@ -44,13 +59,21 @@ namespace Nafir
         void Update()
         {
             stream.SetListener(PoseOf(transform));
-            if (stream.State == told) return;
-            told = stream.State;
-            if (told == NafirState.Refused) Debug.LogError($"Nafir: {stream.Problem}", this);
-            if (told == NafirState.Waiting) Debug.LogWarning($"Nafir: {stream.Problem}. Connecting again.", this);
+            Action told; // declared here for Mono's compiler
+            while (news.TryDequeue(out told)) told();
+        }
+
+        void Tell(NafirState state, string problem)
+        {
+            if (state == NafirState.Refused || state == NafirState.Lost) Debug.LogError($"Nafir: {problem}", this);
+            if (state == NafirState.Waiting) Debug.LogWarning($"Nafir: {problem}. Connecting again.", this);
+            StateChanged?.Invoke(state);
         }
 
         void OnAudioFilterRead(float[] data, int channels) => stream?.AddTo(data, channels);
+
+        /// <summary>Plays a clip of the server once at a transform's present place. Returns the id of its emitter.</summary>
+        public string PlayOneShot(string clip, Transform at, float gainDb = 0) => stream?.PlayOneShot(clip, PoseOf(at), gainDb);
 
         /// <summary>The pose of a transform in the axes of the server's scene.</summary>
         public NafirPose PoseOf(Transform of)

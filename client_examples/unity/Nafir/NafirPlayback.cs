@@ -1,5 +1,6 @@
 // A buffer between the network and the audio thread: one thread pushes, another reads, neither waits and neither allocates.
 //
+// Where the sound has an end (the network stalls, blocks are missing, a lost stream goes on elsewhere) it fades out before and in after.
 // Samples are read at the reader's rate by cubic interpolation. The pace follows the fill by at most 0.2 % (three cents), which makes up
 // for the difference between the server's clock and the sound card's.
 
@@ -10,14 +11,16 @@ namespace Nafir
 {
     public sealed class NafirPlayback
     {
-        const double Fade = 64, Neighbours = 3, CapacityS = 2, MostS = 0.25, SmoothingS = 1, CorrectionS = 10, MostCorrection = 0.002;
+        const double FadeS = 0.005, Neighbours = 3, CapacityS = 2, MostS = 0.25, SmoothingS = 1, CorrectionS = 10, MostCorrection = 0.002;
+        const int MostSeams = 16;
 
         readonly int channels;
-        readonly double writtenRate, step, target;
+        readonly double writtenRate, step, fade, target;
         readonly float[] ring;
         readonly long capacity;
+        readonly long[] seams = new long[MostSeams]; // frames before which the sound was interrupted
         long written, read;
-        int underruns;
+        int seamsWritten, seamsRead, underruns;
 
         // Of the reading thread alone; positions are frames since the first.
         double at, smooth, gain;
@@ -29,13 +32,26 @@ namespace Nafir
             this.channels = channels;
             this.writtenRate = writtenRate;
             step = writtenRate / readRate;
-            target = Math.Max(2 * Fade, targetS * writtenRate);
+            fade = FadeS * writtenRate;
+            target = Math.Max(2 * fade, targetS * writtenRate);
             capacity = (long)(target + CapacityS * writtenRate);
             ring = new float[capacity * channels];
         }
 
         /// <summary>How often the reader found too little.</summary>
         public int Underruns => Volatile.Read(ref underruns);
+
+        /// <summary>Seconds of sound that wait.</summary>
+        public double WaitingS => Math.Max(0, Volatile.Read(ref written) - Volatile.Read(ref read)) / writtenRate;
+
+        /// <summary>What is pushed next does not continue what was pushed before: fades out and in there, and holds back as much as at the
+        /// beginning.</summary>
+        public void Break()
+        {
+            if (seamsWritten - Volatile.Read(ref seamsRead) == MostSeams) return; // a network of nothing but gaps
+            seams[seamsWritten % MostSeams] = written;
+            Volatile.Write(ref seamsWritten, seamsWritten + 1);
+        }
 
         /// <summary>Takes interleaved frames. Returns false if there is no room, because nobody reads.</summary>
         public bool Push(float[] samples, int frames)
@@ -55,17 +71,19 @@ namespace Nafir
             for (int i = 0; i < frames; i++)
             {
                 if (!playing && end - at >= target) Start(end);
-                double free = end - at - Neighbours;
+                double seam = Seam();
+                double free = Math.Min(end, seam) - at - Neighbours;
                 if (!playing || free < pace)
                 {
-                    if (playing) Interlocked.Increment(ref underruns);
+                    if (playing && seam > end) Interlocked.Increment(ref underruns);
+                    if (seam <= end) at = seam;
                     playing = false;
                     Array.Clear(output, i * channels, channels);
                     continue;
                 }
                 // After a stall, too much comes at once: fades out, and goes on with the newest.
                 if (end - at > target + MostS * writtenRate) skipping = true;
-                gain = skipping ? gain - 1 / Fade : Math.Min(Math.Min(gain + 1 / Fade, free / Fade), 1);
+                gain = skipping ? gain - 1 / fade : Math.Min(Math.Min(gain + 1 / fade, free / fade), 1);
                 if (skipping && gain <= 0)
                 {
                     Start(end);
@@ -75,6 +93,14 @@ namespace Nafir
                 at += pace;
             }
             Volatile.Write(ref read, Math.Max(0, (long)at - 1));
+        }
+
+        /// <summary>Where the sound ends next, though more has been written.</summary>
+        double Seam()
+        {
+            int count = Volatile.Read(ref seamsWritten);
+            while (seamsRead != count && seams[seamsRead % MostSeams] <= at) Volatile.Write(ref seamsRead, seamsRead + 1);
+            return seamsRead != count ? seams[seamsRead % MostSeams] : double.PositiveInfinity;
         }
 
         void Start(long end)

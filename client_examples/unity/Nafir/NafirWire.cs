@@ -9,6 +9,9 @@ namespace Nafir
     /// <summary>A block of rendered audio. `Samples` are interleaved.</summary>
     public sealed class NafirBlock
     {
+        /// <summary>A bit of `Flags`: the server had not rendered the block in time.</summary>
+        public const byte Late = 2;
+
         public uint Sequence, PoseId, ReverberationPoseId;
         public ulong SampleClock;
         public byte Flags;
@@ -23,6 +26,18 @@ namespace Nafir
         public NafirPose Pose;
         public float GainDb;
         public bool Loop = true;
+
+        /// <summary>The clocks of the stream at which the clip begins and from which on it fades out; null for at once, and never.</summary>
+        public ulong? StartAt, StopAt;
+
+        /// <summary>Where in the clip to begin, and what a loop repeats; an end of 0 is the clip's.</summary>
+        public float OffsetS, LoopStartS, LoopEndS;
+
+        /// <summary>Whether the emitter is removed once the clip and its reverberation are over.</summary>
+        public bool RemoveWhenEnded;
+
+        /// <summary>How long samples of a live emitter wait at the server; 0 for its own choice.</summary>
+        public float JitterMs;
     }
 
     public static class NafirWire
@@ -85,27 +100,59 @@ namespace Nafir
             return data;
         }
 
-        /// <summary>The first message. A `sampleRate` of 0 takes the scene's own.</summary>
-        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener)
+        /// <summary>The first message. A `sampleRate` of 0 takes the scene's own, a `level` of null is the server's choice.</summary>
+        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null)
         {
             var rate = sampleRate > 0 ? $",\"sample_rate\":{sampleRate}" : "";
+            var quality = level != null ? $",\"level\":{NafirJson.Quote(level)}" : "";
             return $"{{\"type\":\"hello\",\"protocol\":{Protocol},\"scene\":{NafirJson.Quote(scene)},\"block_size\":{blockSize},\"encoding\":\"s16\","
-                + $"\"buffer_blocks\":{bufferBlocks},\"listener\":{{{Text(listener)}}}{rate}}}";
+                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}}}";
         }
 
-        public static string AddEmitter(string id, NafirSource source)
+        /// <summary>The first message of a connection that goes on with a lost stream. `token` is that of the last welcome, `snapshot` the newest
+        /// one; either may be null. `last` is the last block that arrived, if one has.</summary>
+        public static string Resume(string token, string snapshot, NafirBlock last)
         {
-            var sound = source.Clip == null ? "\"live\":true" : $"\"clip\":{NafirJson.Quote(source.Clip)},\"loop\":{(source.Loop ? "true" : "false")}";
-            return $"{{\"type\":\"add_emitter\",\"id\":{NafirJson.Quote(id)},{sound},\"gain_db\":{Text(source.GainDb)},{Text(source.Pose)}}}";
+            var text = $"{{\"type\":\"resume\",\"protocol\":{Protocol}";
+            if (token != null) text += $",\"token\":{NafirJson.Quote(token)}";
+            if (snapshot != null) text += $",\"snapshot\":{NafirJson.Quote(snapshot)}";
+            if (last != null) text += $",\"sequence\":{last.Sequence},\"sample_clock\":{last.SampleClock}";
+            return text + "}";
+        }
+
+        /// <summary>Clocks of the source are those of the stream, which is `clockOffset` samples ahead of the server's.</summary>
+        public static string AddEmitter(string id, NafirSource source, ulong clockOffset = 0)
+        {
+            var text = $"{{\"type\":\"add_emitter\",\"id\":{NafirJson.Quote(id)},\"gain_db\":{Text(source.GainDb)},{Text(source.Pose)}";
+            if (source.Clip == null) return text + ",\"live\":true" + (source.JitterMs > 0 ? $",\"jitter_ms\":{Text(source.JitterMs)}}}" : "}");
+            text += $",\"clip\":{NafirJson.Quote(source.Clip)},\"loop\":{Text(source.Loop)}";
+            if (source.StartAt != null) text += $",\"start_at\":{Server(source.StartAt.Value, clockOffset)}";
+            if (source.StopAt != null) text += $",\"stop_at\":{Server(source.StopAt.Value, clockOffset)}";
+            if (source.OffsetS > 0) text += $",\"offset_s\":{Text(source.OffsetS)}";
+            if (source.Loop && source.LoopStartS > 0) text += $",\"loop_start_s\":{Text(source.LoopStartS)}";
+            if (source.Loop && source.LoopEndS > 0) text += $",\"loop_end_s\":{Text(source.LoopEndS)}";
+            if (source.RemoveWhenEnded) text += ",\"remove_when_ended\":true";
+            return text + "}";
         }
 
         public static string MoveEmitter(string id, uint poseId, NafirPose pose) =>
             $"{{\"type\":\"move_emitter\",\"id\":{NafirJson.Quote(id)},\"pose_id\":{poseId},{Text(pose)}}}";
 
-        public static string SetGain(string id, float gainDb) =>
-            $"{{\"type\":\"set_gain\",\"id\":{NafirJson.Quote(id)},\"gain_db\":{Text(gainDb)}}}";
+        public static string SetGain(string id, float gainDb, float rampS = 0) =>
+            $"{{\"type\":\"set_gain\",\"id\":{NafirJson.Quote(id)},\"gain_db\":{Text(gainDb)},\"ramp_s\":{Text(rampS)}}}";
+
+        /// <summary>Lets a clip fade out from a clock on, or at once (null).</summary>
+        public static string StopEmitter(string id, ulong? stopAt, float fadeS, ulong clockOffset = 0)
+        {
+            var at = stopAt != null ? $",\"stop_at\":{Server(stopAt.Value, clockOffset)}" : "";
+            return $"{{\"type\":\"stop_emitter\",\"id\":{NafirJson.Quote(id)},\"fade_s\":{Text(fadeS)}{at}}}";
+        }
 
         public static string RemoveEmitter(string id) => $"{{\"type\":\"remove_emitter\",\"id\":{NafirJson.Quote(id)}}}";
+
+        public static string SetLevel(string level) => $"{{\"type\":\"set_level\",\"level\":{NafirJson.Quote(level)}}}";
+
+        public static string Ping(uint id) => $"{{\"type\":\"ping\",\"id\":{id}}}";
 
         /// <summary>Every block up to `sequence` has arrived. Without it the server soon stops sending.</summary>
         public static string Acknowledge(uint sequence) => $"{{\"type\":\"acknowledge\",\"sequence\":{sequence}}}";
@@ -122,6 +169,10 @@ namespace Nafir
             var texts = Array.ConvertAll(Numbers(pose), Text);
             return $"\"position\":[{string.Join(",", texts, 0, 3)}],\"orientation\":[{string.Join(",", texts, 3, 4)}]";
         }
+
+        static ulong Server(ulong clock, ulong offset) => clock - Math.Min(clock, offset);
+
+        static string Text(bool value) => value ? "true" : "false";
 
         // With a point whatever the language of the system.
         static string Text(float value) => value.ToString("R", CultureInfo.InvariantCulture);

@@ -1,0 +1,116 @@
+"""Clients of engines when their connection, or their server, is lost: what the game is told, and what is heard."""
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.clients.test_unity import MONO, needs_mono
+from tests.clients.test_unity import program as unity_program
+from tests.integration import losing
+from tests.integration.losing import until
+from tests.integration.lossy_proxy import LossyProxy
+from tests.integration.test_resuming import free_port, serving_until_drained
+
+unity = unity_program
+
+Player = Callable[..., AbstractContextManager[Iterator[str]]]
+"""Plays a clip of a server for some seconds, writes what is heard to a file, and gives the lines that it says: `state
+STATE SAMPLE PROBLEM` with the samples heard by then, the messages of the server, and at the `end` what was counted.
+While its connection is lost it adds an emitter."""
+
+
+@pytest.fixture(params=[pytest.param("unity", marks=needs_mono)])
+def player(request) -> Player:
+    program = request.getfixturevalue(request.param)
+    command = {"unity": [MONO, program]}[request.param]
+
+    @contextmanager
+    def play(address: str, seconds: float, output: Path, *, give_up_after_s: float = 60.0) -> Iterator[Iterator[str]]:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                url = f"ws://{address}/v1/stream"
+                process.stdin.write(f"hear {url} flat {losing.CLIP} {seconds} {output} {give_up_after_s}\n")
+                process.stdin.close()
+                yield process.stdout
+            finally:
+                process.kill()
+
+    return play
+
+
+def assert_only_a_gap(path: Path, sample: int) -> None:
+    heard = losing.read(path)
+    gap = losing.gap_around(heard, sample)
+    losing.assert_no_click(heard, gap)
+    losing.assert_same_clip_position(heard, gap)
+
+
+def test_a_lost_connection_costs_a_fade_and_nothing_else(player, served, tmp_path):
+    with LossyProxy(served).running() as network, player(network.address, 6, tmp_path / "heard") as lines:
+        until(lines, "emitter_added source")
+        time.sleep(2.0)
+        network.cut()
+        assert "Waiting" in until(lines, "state")
+        _, state, sample, *_ = until(lines, "state", "emitter_added").split()
+        assert state == "Live"
+        # What was asked for meanwhile, and nothing that was there already.
+        assert until(lines, "emitter_added") == "emitter_added late"
+        _, state, reconnections, resumptions, _, waiting_s, round_trip_s, _, level = until(lines, "end").split()
+    assert (state, reconnections, resumptions, level) == ("Live", "1", "1", "standard")
+    assert float(waiting_s) < 0.15  # what came at once after the gap does not stay in the buffer
+    assert 0 < float(round_trip_s) < 1
+    assert_only_a_gap(tmp_path / "heard", int(sample))
+
+
+@pytest.mark.long
+def test_a_server_that_shuts_down_hands_the_stream_to_another(player, bundle, hrtfs, tmp_path):
+    """By the snapshot that it sends before it goes."""
+    with (
+        serving_until_drained(bundle, hrtfs) as (old, shut_down),
+        serving_until_drained(bundle, hrtfs) as (new, _),
+        LossyProxy(old).running() as network,
+        player(network.address, 9, tmp_path / "heard") as lines,
+    ):
+        until(lines, "emitter_added source")
+        time.sleep(2.0)
+        network.redirect(new)
+        shut_down()
+        lost = until(lines, "state")
+        assert "Waiting" in lost
+        assert "server_draining" in lost
+        _, state, sample, *_ = until(lines, "state", "emitter_added").split()
+        assert state == "Live"
+        assert until(lines, "emitter_added") == "emitter_added late"
+        _, state, reconnections, resumptions, *_ = until(lines, "end").split()
+    assert (state, reconnections, resumptions) == ("Live", "1", "1")
+    assert_only_a_gap(tmp_path / "heard", int(sample))
+
+
+@pytest.mark.long
+def test_a_stream_that_is_kept_nowhere_begins_anew_and_a_server_that_is_gone_is_given_up(
+    player, served, bundle, hrtfs, tmp_path
+):
+    with (
+        serving_until_drained(bundle, hrtfs) as (other, _),
+        LossyProxy(served).running() as network,
+        player(network.address, 30, tmp_path / "heard", give_up_after_s=1.5) as lines,
+    ):
+        until(lines, "emitter_added source")
+        network.redirect(other)
+        network.cut()
+        assert "Waiting" in until(lines, "state")
+        begun_anew = until(lines, "state")
+        assert "Live" in begun_anew
+        assert "unknown_resume_token" in begun_anew
+        added = {until(lines, "emitter_added") for _ in range(2)}
+        assert added == {"emitter_added source", "emitter_added late"}
+        network.redirect(f"127.0.0.1:{free_port()}")
+        network.cut()
+        assert "Waiting" in until(lines, "state")
+        assert "Lost" in until(lines, "state")
+        _, state, reconnections, resumptions, *_ = until(lines, "end").split()
+    assert (state, reconnections, resumptions) == ("Lost", "1", "0")
