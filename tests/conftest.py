@@ -50,6 +50,14 @@ _TIMED = ("api/", "bench/", "integration/", "runtime/", "streaming/")
 """Folders with `timed` tests: TIMED of the Makefile."""
 
 
+@pytest.hookimpl(tryfirst=True, optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int | None:
+    """Half as many again as there are cores: for a quarter of the time tests wait, for browsers and for sound to pass.
+    PYTEST_XDIST_AUTO_NUM_WORKERS says otherwise."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return None if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ else cores + (cores + 1) // 2
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Before workers start, what they would all compile is compiled."""
     if session.config.getoption("dist", "no") != "no" and not hasattr(session.config, "workerinput"):
