@@ -120,6 +120,13 @@ def test_a_folder_that_cannot_be_read_changes_nothing(bundle, watched, caplog):
     assert "cannot be read" in caplog.text
 
 
+@pytest.fixture
+def at_once(monkeypatch):
+    """What nothing waits for is measured at once: the folder is looked at again only after that."""
+    monkeypatch.setattr(app, "_COSTS_AFTER_S", 0.0)
+    monkeypatch.setattr(app, "_COSTS_SHARE", 1.0)
+
+
 @contextmanager
 def serving(watched, bundle, hrtfs):
     settings = Settings(bundle_folder=watched, bundle_folder_s=0.1, stall_timeout_s=120)
@@ -153,7 +160,7 @@ def received(socket, kind):
             return parsed
 
 
-@pytest.mark.timed
+@pytest.mark.usefixtures("at_once")
 def test_a_bundle_whose_field_fails_keeps_no_other_from_coming(bundle, hrtfs, watched, monkeypatch):
     usual = app._prepared
 
@@ -173,7 +180,7 @@ def test_a_bundle_whose_field_fails_keeps_no_other_from_coming(bundle, hrtfs, wa
         until(lambda: "later" in names(client))
 
 
-@pytest.mark.timed
+@pytest.mark.usefixtures("at_once")
 def test_a_stream_finishes_with_the_scene_that_it_began_in(bundle, hrtfs, watched):
     put(bundle, watched / "hall", id="hall", name="A hall")
     with serving(watched, bundle, hrtfs) as client:

@@ -35,8 +35,6 @@ from server.protocol.server_messages import (
 from server.scene.effects import EffectName
 from tests.directional_flat import write_directional
 
-pytestmark = pytest.mark.timed
-
 HELLO = Hello(protocol=PROTOCOL, scene="flat")
 TALKER = AddEmitter(id="talker", clip="tone", position=(6.0, 3.0, 1.5))
 

@@ -24,8 +24,6 @@ from server.protocol.server_messages import EmitterAdded, Error, Status, parse_s
 from tests.api.test_routes import wait_until_ready
 from tests.assets.uploads import KINDS, encoded, mutated
 
-pytestmark = pytest.mark.timed
-
 WAV = encoded("wav")
 
 

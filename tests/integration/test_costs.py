@@ -4,15 +4,19 @@ import os
 
 import pytest
 
-from server.bench import costs
+from server.bench import costs, sessions
 from server.bench.capacity import TERMS, Model
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core")
+pytestmark = [
+    pytest.mark.untimed,
+    pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core"),
+]
 
 
 def test_every_part_of_a_real_server_is_measured(monkeypatch):
     monkeypatch.setattr(costs, "EMITTERS", (1, 3))
     monkeypatch.setattr(costs, "_MOST", 3)
+    monkeypatch.setattr(sessions, "_SETTLE_S", 0.5)
     steps = []
     measured = costs.measure_costs("apartment", step_s=1.5, advance=steps.append)
     assert (measured.scene, measured.sample_rate, measured.block_size) == ("apartment", 24_000, 256)

@@ -14,6 +14,8 @@ from server.offline.render import PathPoint, RenderedEmitter, render
 from server.responses.direct_sound import DirectSound
 from server.scene.effects import EffectName
 
+pytestmark = pytest.mark.untimed
+
 LIVE = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "live.py"
 
 
@@ -56,7 +58,6 @@ def test_without_a_recording_it_claps(served, tmp_path):
     assert np.sqrt(np.mean(heard[:rate] ** 2)) > 1e-3
 
 
-@pytest.mark.untimed
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [

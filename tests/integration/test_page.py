@@ -13,7 +13,7 @@ from tests.visitor import LISTENING_S, free_port, level_db, listen, open_page, p
 
 browser = visitor.browser
 page = visitor.page
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 WALKED = """([x, y]) => {
   const [nowX, nowY] = nafir.state().listener.position;
@@ -40,7 +40,6 @@ def test_sound_arrives_and_its_latency_is_measured(page):
     assert page.evaluate("nafir.state().reverberationLatency.totalMs") >= latency["totalMs"] - 20
 
 
-@pytest.mark.untimed
 def test_turning_the_head_around_swaps_the_louder_ear(page):
     page.evaluate("nafir.setEmitter('A', { x: 3.2, y: 2.5 })")
     page.evaluate("nafir.setListener({ x: 2.0, y: 2.5, yaw: -Math.PI / 2 })")
@@ -61,7 +60,6 @@ def play_trumpet(page) -> float:
     return next(clip["duration_s"] for clip in clips if clip["name"] == "trumpet")
 
 
-@pytest.mark.untimed
 def test_walking_away_makes_it_quieter(page):
     turn_s = play_trumpet(page)
     page.evaluate("nafir.setEmitter('A', { x: 1.2, y: 3.8 })")
@@ -75,7 +73,6 @@ def test_walking_away_makes_it_quieter(page):
     assert far < near - 5
 
 
-@pytest.mark.untimed
 def test_the_gain_of_a_source_is_heard(page):
     turn_s = play_trumpet(page)
     page.evaluate("nafir.setEmitter('A', { x: 2.2, y: 2.8 })")
@@ -88,7 +85,6 @@ def test_the_gain_of_a_source_is_heard(page):
     assert after == pytest.approx(before - 20, abs=4)
 
 
-@pytest.mark.untimed
 def test_pause_ends_the_stream_and_play_takes_it_up_again(page):
     start(page)
     page.click("#play")
@@ -98,7 +94,6 @@ def test_pause_ends_the_stream_and_play_takes_it_up_again(page):
     assert np.all(level_db(listen(page)) > -70)
 
 
-@pytest.mark.untimed
 def test_dragging_and_keys_move_what_they_should(page):
     def centre(selector: str) -> tuple[float, float]:
         box = page.locator(selector).bounding_box()
@@ -145,7 +140,6 @@ def test_dragging_and_keys_move_what_they_should(page):
     assert walked["yaw"] == turned
 
 
-@pytest.mark.untimed
 def test_nobody_walks_through_walls(page):
     page.evaluate("nafir.setListener({ x: 3.0, y: 1.0, yaw: 0 })")
     page.keyboard.down("Shift")
@@ -159,7 +153,6 @@ def test_nobody_walks_through_walls(page):
     assert y == pytest.approx(1.0)
 
 
-@pytest.mark.untimed
 def test_a_second_source_is_heard_too(page):
     start(page)
     page.click("#add-source")
@@ -171,7 +164,6 @@ def test_a_second_source_is_heard_too(page):
     assert np.all(level_db(listen(page)) > -70)
 
 
-@pytest.mark.untimed
 def test_an_error_of_the_server_is_shown_and_the_stream_goes_on(browser, server):
     context = browser.new_context()
     context.route(
@@ -188,7 +180,6 @@ def test_an_error_of_the_server_is_shown_and_the_stream_goes_on(browser, server)
     context.close()
 
 
-@pytest.mark.untimed
 def test_a_lost_connection_is_taken_up_again(browser, server):
     port = free_port()
     context = browser.new_context()

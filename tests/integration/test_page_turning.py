@@ -13,7 +13,7 @@ from tests.visitor import free_port, level_db, listen, open_page, serving, start
 
 browser = visitor.browser
 page = visitor.page
-pytestmark = visitor.needs_browser
+pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,6 @@ def test_a_turn_is_heard_sooner_than_a_step_and_both_times_are_shown(page):
     assert page.inner_text("#latency-turn-held").endswith(" ms")
 
 
-@pytest.mark.untimed
 def test_turning_the_head_around_swaps_the_louder_ear(page):
     beside(page)
     start(page)
@@ -62,7 +61,6 @@ def test_turning_the_head_around_swaps_the_louder_ear(page):
     assert right > left + 1
 
 
-@pytest.mark.untimed
 def test_turns_need_no_server(page):
     """A turn that no message tells the server is heard all the same."""
     beside(page)
@@ -75,7 +73,6 @@ def test_turns_need_no_server(page):
     assert right > left + 1
 
 
-@pytest.mark.untimed
 def test_where_sound_is_turned_is_chosen_while_listening(page):
     beside(page)
     start(page)
@@ -103,7 +100,6 @@ def test_where_sound_is_turned_is_chosen_while_listening(page):
     assert page.locator(".notice").count() == 0
 
 
-@pytest.mark.untimed
 def test_a_scene_that_knows_no_directions_is_turned_by_the_server(browser, server):
     context = browser.new_context()
     context.route(
@@ -120,7 +116,6 @@ def test_a_scene_that_knows_no_directions_is_turned_by_the_server(browser, serve
     context.close()
 
 
-@pytest.mark.untimed
 def test_without_the_filters_of_the_head_the_server_turns(browser, server):
     context = browser.new_context()
     context.route(
@@ -136,7 +131,6 @@ def test_without_the_filters_of_the_head_the_server_turns(browser, server):
     context.close()
 
 
-@pytest.mark.untimed
 def test_without_a_field_two_ears_are_heard_until_the_browser_is_chosen(browser, server):
     with visitor.visit(browser, server.replace("scene=flat", "scene=open-field")) as page:
         assert page.eval_on_selector("#turning", "menu => [menu.value, menu.disabled]") == ["server", False]

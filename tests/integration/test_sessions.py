@@ -10,13 +10,17 @@ from server.bench import sessions
 from server.bench.cli import app
 from server.core.errors import NafirError
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core")
+pytestmark = [
+    pytest.mark.untimed,
+    pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be confined to a core"),
+]
 
 
 @pytest.mark.parametrize(
     ("scene", "sample_rate"), [("bench", 48_000), pytest.param("apartment", 24_000, marks=pytest.mark.long)]
 )
-def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own(scene, sample_rate):
+def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own(monkeypatch, scene, sample_rate):
+    monkeypatch.setattr(sessions, "_SETTLE_S", 0.5)
     usable = os.sched_getaffinity(0)
     options = ["--scene", scene, "--emitters", "3", "--sessions", "2", "--duration-s", "2", "--json"]
     outcome = CliRunner().invoke(app, ["stream", *options])

@@ -15,6 +15,8 @@ from server.field.fields_by_level import FieldsByLevel
 from server.rendering.head_decoder import HeadDecoder
 from tests.directional_flat import write_directional
 
+pytestmark = pytest.mark.untimed
+
 TURN = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "turn.py"
 BLOCK_SIZE = 256
 
@@ -40,7 +42,6 @@ def turn(address, *options):
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-@pytest.mark.untimed
 def test_the_head_turns_to_the_left_and_nods(client):
     for time_s, yaw, pitch_deg in [(0.0, 0.3, 0), (0.5, 0.3 + np.pi / 8, 10), (1.5, 0.3 + 3 * np.pi / 8, -10)]:
         expected = Quaternion.from_angles(yaw, np.radians(pitch_deg), 0.0)
@@ -73,7 +74,6 @@ def test_the_stream_is_heard_turned_and_through_the_heads_filters(client, served
     np.testing.assert_allclose(ears.T, expected, atol=1e-5 * np.abs(ears).max())
 
 
-@pytest.mark.untimed
 def test_a_scene_that_knows_no_directions_says_so(served, tmp_path):
     done = turn(served, "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1
@@ -81,13 +81,11 @@ def test_a_scene_that_knows_no_directions_says_so(served, tmp_path):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.untimed
 def test_a_head_there_is_not_is_told(served_directional, tmp_path):
     done = turn(served_directional, "--head", "moomin", "-o", str(tmp_path / "heard.wav"))
     assert (done.returncode, done.stderr) == (1, "unknown_hrtf: there is no HRTF 'moomin', only kemar\n")
 
 
-@pytest.mark.untimed
 def test_a_turn_without_a_server_says_so(tmp_path):
     done = turn("127.0.0.1:1", "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1

@@ -25,6 +25,8 @@ from server.responses.direct_sound import DirectSound
 from server.scene.bundle import write_bundle
 from server.scene.manifest import QualityLevel
 
+pytestmark = pytest.mark.untimed
+
 WALK = Path(__file__).resolve().parents[2] / "client_examples" / "python" / "walk.py"
 
 
@@ -132,21 +134,18 @@ def test_a_walk_whose_level_changes_is_rendered_again_by_the_command_it_prints(s
     np.testing.assert_array_equal(offline, live)
 
 
-@pytest.mark.untimed
 def test_a_walk_where_there_is_no_such_scene_says_so(served, tmp_path):
     done = walk(served, "--scene", "moon", "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1
     assert done.stderr.strip() == "unknown_scene: there is no scene 'moon'"
 
 
-@pytest.mark.untimed
 def test_a_walk_at_a_level_there_is_not_says_which_there_are(served, tmp_path):
     done = walk(served, "--scene", "flat", "--level", "best", "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1
     assert done.stderr.strip() == "unknown_level: 'best' is none of auto, standard"
 
 
-@pytest.mark.untimed
 def test_a_walk_without_a_server_says_so(tmp_path):
     done = walk("127.0.0.1:1", "-o", str(tmp_path / "heard.wav"))
     assert done.returncode == 1
@@ -154,7 +153,6 @@ def test_a_walk_without_a_server_says_so(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.untimed
 @pytest.mark.parametrize("url", ["http://127.0.0.1/", "ws://{served}/v1/elsewhere"])
 def test_a_walk_to_the_wrong_address_says_so_in_one_line(served, tmp_path, url):
     url = url.format(served=served)
@@ -164,7 +162,6 @@ def test_a_walk_to_the_wrong_address_says_so_in_one_line(served, tmp_path, url):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.untimed
 def test_a_walk_whose_server_goes_away_says_so_in_one_line(field, tmp_path):
     welcome = Welcome(
         session="s",
