@@ -6,6 +6,18 @@ import numpy as np
 import numpy.typing as npt
 
 OCTAVE_BANDS_HZ = (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0)
+FILTER_BANDS_HZ = (*OCTAVE_BANDS_HZ, 16000.0)
+"""The bands of filters for paths. The last is known of the air alone: surfaces and directivities are there as in the
+one below."""
+
+
+def in_filter_bands(air_db_per_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(filter band,) absorption of air that is given in OCTAVE_BANDS_HZ or FILTER_BANDS_HZ. The former goes on as in
+    the last band. Raises ValueError for another number of bands."""
+    given = np.array(air_db_per_m, np.float64)
+    if given.shape not in ((len(OCTAVE_BANDS_HZ),), (len(FILTER_BANDS_HZ),)):
+        raise ValueError(f"air_db_per_m must have a value for each octave band, and has the shape {given.shape}")
+    return given if len(given) == len(FILTER_BANDS_HZ) else np.append(given, given[-1])
 
 
 def bands_within(sample_rate: float) -> int:

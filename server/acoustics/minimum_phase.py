@@ -8,7 +8,7 @@ A folded cepstrum is the power series of the logarithm of a causal minimum-phase
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import FILTER_BANDS_HZ
 
 _Floats = npt.NDArray[np.float64]
 
@@ -63,12 +63,12 @@ def _peak(circular: _Floats, advance: int) -> _Floats:
 
 
 def band_cepstra(sample_rate: float, taps: int) -> _Floats:
-    """(band, tap) folded cepstrum of a gain of one decibel in each octave band. The gain is linear over log frequency
-    between band centres and flat beyond the first and the last.
+    """(band, tap) folded cepstrum of a gain of one decibel in each of FILTER_BANDS_HZ. The gain is linear over log
+    frequency between band centres and flat beyond the first and the last.
 
     A short cepstrum smooths the corners of this shape. The shapes are mixed so that the gains are exact at the centres.
     """
-    centres = np.array(OCTAVE_BANDS_HZ)
+    centres = np.array(FILTER_BANDS_HZ)
     n_fft = 2 ** int(np.ceil(np.log2(64 * taps)))
     frequency = np.maximum(np.fft.rfftfreq(n_fft, 1 / sample_rate), 1.0)
     octave = np.clip(np.log2(frequency / centres[0]), 0, len(centres) - 1)
@@ -79,4 +79,5 @@ def band_cepstra(sample_rate: float, taps: int) -> _Floats:
     audible = centres < sample_rate / 2
     at_centres = shapes @ np.cos(2 * np.pi / sample_rate * np.outer(np.arange(taps), centres)) / nepers
     shapes[audible] = np.linalg.solve(at_centres[np.ix_(audible, audible)], shapes[audible])
+    shapes[~audible] -= at_centres[np.ix_(~audible, audible)] @ shapes[audible]
     return shapes

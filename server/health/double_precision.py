@@ -295,7 +295,7 @@ class DoubleStillPaths(StillPaths):
         total = np.zeros(out.shape)
         for length, arrival, gains_db in zip(lengths_m, arrivals, band_gains_db, strict=True):
             corners, weights = self._triangle(axes_of(orientation) @ arrival)
-            levels_db = gains_db - tables.air_db_per_m * length
+            levels_db = np.append(gains_db, gains_db[-1]) - tables.air_db_per_m * length
             cepstra = np.einsum("c,cen->en", weights, _double(tables.cepstra[corners]))
             cepstra += levels_db @ _double(tables.band_cepstra)
             delays_s = length / tables.speed_of_sound + weights @ tables.head_delays_s[corners]
@@ -332,7 +332,9 @@ class DoubleFullResponse(FullResponse):
     def __init__(self, field: AcousticField, filters: HeadFilters) -> None:
         super().__init__(field if isinstance(field, Silence) else _DoubleField(field.through(filters)), filters)
         paths = DoubleStillPaths(
-            filters, speed_of_sound=field.bundle.manifest.speed_of_sound, air_db_per_m=self._air_db_per_m
+            filters,
+            speed_of_sound=field.bundle.manifest.speed_of_sound,
+            air_db_per_m=field.bundle.manifest.air.filter_db_per_m,
         )
         self._direct = paths
         if self._early is not None:

@@ -61,7 +61,7 @@ class _Lane:
             sample_rate=rate,
             filters=kemar(rate),
             speed_of_sound=manifest.speed_of_sound,
-            air_db_per_m=manifest.air.absorption_db_per_m,
+            air_db_per_m=manifest.air.filter_db_per_m,
             max_emitters=emitters,
             shared_tail=not variant.shared.own_tails,
             outputs=variant.shared.channels,

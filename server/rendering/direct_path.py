@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import OCTAVE_BANDS_HZ, in_filter_bands
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.acoustics.spherical_harmonics import harmonic_count
@@ -60,7 +60,9 @@ class DirectPath:
         max_distance_m: float = 200.0,
         order: int | None = None,
     ) -> None:
-        """`filters` describe a head; None means one ear without a head or, with an `order`, ambisonic channels in world
+        """`air_db_per_m` has a value for each octave band, and may have one for the octave above.
+
+        `filters` describe a head; None means one ear without a head or, with an `order`, ambisonic channels in world
         axes: ACN order, SN3D norm, with unit gain in the first."""
         if order is not None and filters is not None:
             raise ValueError("ambisonic channels are heard through no head")
@@ -217,7 +219,7 @@ def _state(
         lanes=lanes,
         fade=raised_cosine(block_size),
         ramp=(np.arange(1, block_size + 1) / block_size).astype(np.float32),
-        air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
+        air_db_per_m=in_filter_bands(air_db_per_m),
         weights=doubles(3),
         cepstrum=floats(2, taps + 8),
         sums=floats(2, taps + 8),

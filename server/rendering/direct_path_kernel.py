@@ -31,6 +31,7 @@ import server.rendering.path_loops as loops
 from server.kernels.compiled import compiled_in_place
 from server.rendering.direct_path_records import (
     BANDS,
+    FILTER_BANDS,
     FILTERED,
     MUTED,
     NOT_STARTED,
@@ -268,7 +269,7 @@ def _add_plain(state: DirectPathState, block: FloatArray, before: bool, after: b
 def _colours(slot: Any) -> bool:
     """Whether anything on the path has a gain in some band."""
     most = 0.0
-    for band in range(BANDS):
+    for band in range(FILTER_BANDS):
         most = max(most, abs(slot.bands_db[band]))
     return most > 0.0
 
@@ -317,8 +318,8 @@ def _change(slot: Any, to_head: DoubleArray, air_db_per_m: DoubleArray) -> int:
         slot.direction[axis] = along
         turned += (along - slot.filtered_direction[axis]) ** 2
     difference_db = 0.0
-    for band in range(BANDS):
-        level = slot.band_gain_db[band]
+    for band in range(FILTER_BANDS):
+        level = slot.band_gain_db[min(band, BANDS - 1)]
         if not slot.airless:
             level -= air_db_per_m[band] * slot.length[_AT]
         slot.bands_db[band] = level
@@ -333,7 +334,7 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
     """Compute the filters and the head's delays for the direction and bands of a slot."""
     for axis in range(3):
         slot.filtered_direction[axis] = slot.direction[axis]
-    for band in range(BANDS):
+    for band in range(FILTER_BANDS):
         slot.filtered_db[band] = slot.bands_db[band]
     count, ears = state.next_taps.shape[1], state.cepstra.shape[1]
     triangle = 0
@@ -349,7 +350,7 @@ def _find_filters(state: DirectPathState, slot: Any) -> None:
                 direction = state.triangles[triangle, corner]
                 delay += state.weights[corner] * state.head_delays_s[direction, ear]
                 loops.add_scaled(state.cepstra[direction, ear], state.weights[corner], cepstrum)
-        for band in range(BANDS):
+        for band in range(FILTER_BANDS):
             loops.add_scaled(state.band_cepstra[band], slot.bands_db[band], cepstrum)
         loops.weight(cepstrum, state.orders)
         slot.head_goal_s[ear] = delay

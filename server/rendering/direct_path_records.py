@@ -10,6 +10,7 @@ DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 BANDS = 7
+FILTER_BANDS = 8
 
 NOT_STARTED, MUTED, UNFILTERED, FILTERED = 0, 1, 2, 3
 """The mode of a slot in the last block: inaudible with nothing left to play; inaudible but with its delay line kept up
@@ -41,11 +42,11 @@ SLOT = np.dtype(
         ("slope", np.float64, 2),  # samples per sample
         ("gain", np.float64),
         ("direction", np.float64, 3),  # in head axes
-        ("bands_db", np.float64, BANDS),
+        ("bands_db", np.float64, FILTER_BANDS),
         # The direction and bands for which the filters were computed, and the triangle in which the direction was
         # found.
         ("filtered_direction", np.float64, 3),
-        ("filtered_db", np.float64, BANDS),
+        ("filtered_db", np.float64, FILTER_BANDS),
         ("triangle", np.int64),
     ],
     align=True,
@@ -71,7 +72,7 @@ class DirectPathState(NamedTuple):
     triangles: IntArray
     across: IntArray
     inverses: DoubleArray
-    band_cepstra: FloatArray  # (band, n) for a gain of one decibel
+    band_cepstra: FloatArray  # (filter band, n) for a gain of one decibel
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
     sinc: FloatArray
@@ -80,7 +81,7 @@ class DirectPathState(NamedTuple):
     lanes: FloatArray
     fade: FloatArray  # (b,) from 0 to 1
     ramp: FloatArray  # (b,) rises in a straight line, sampled at the end of each sample
-    air_db_per_m: DoubleArray  # (band,) >= 0
+    air_db_per_m: DoubleArray  # (filter band,) >= 0
 
     # Buffers for intermediate results.
     weights: DoubleArray  # (3,)

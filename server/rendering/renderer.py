@@ -82,7 +82,7 @@ class Renderer:
     can hear IRs of as many channels as they have.
 
     `filters` are the head for direct paths, at `sample_rate`; without them there are only IRs, which must then include
-    the direct sound. `air_db_per_m` (7,) is the absorption of air per octave band. With a `ceiling`, no sample of the
+    the direct sound. `air_db_per_m` is the absorption of air per octave band. With a `ceiling`, no sample of the
     output exceeds it (`server.rendering.limiter`). `has_head` says whether to begin with a head. Raises ValueError for
     a `block_size` that is not one of `BLOCK_SIZES`.
 

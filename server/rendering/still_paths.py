@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import in_filter_bands
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.rendering.direct_path import NEAR_LIMIT_M
@@ -25,8 +25,8 @@ def _band_cepstra(sample_rate: int, taps: int) -> FloatArray:
 
 
 class StillPaths:
-    """Adds responses of static paths for one head and the air around it; threads may share it. `air_db_per_m` (band,)
-    >= 0.
+    """Adds responses of static paths for one head and the air around it; threads may share it. `air_db_per_m` >= 0 has
+    a value for each octave band, and may have one for the octave above.
 
     Without a head there is one ear, and responses have one channel, or 4, 9 or 16 ambisonic ones in ACN order and SN3D
     norm.
@@ -46,7 +46,7 @@ class StillPaths:
             orders=orders.astype(np.float32),
             reciprocals=(1 / orders).astype(np.float32),
             sinc=sinc_table(),
-            air_db_per_m=np.array(air_db_per_m, np.float64).reshape(len(OCTAVE_BANDS_HZ)),
+            air_db_per_m=in_filter_bands(air_db_per_m),
             sample_rate=float(filters.sample_rate),
             speed_of_sound=float(speed_of_sound),
             nearest_m=NEAR_LIMIT_M,

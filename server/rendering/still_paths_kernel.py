@@ -29,11 +29,11 @@ class StillPathTables(NamedTuple):
     triangles: IntArray
     across: IntArray
     inverses: DoubleArray
-    band_cepstra: FloatArray  # (band, n) for a gain of one decibel
+    band_cepstra: FloatArray  # (filter band, n) for a gain of one decibel
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
     sinc: FloatArray
-    air_db_per_m: DoubleArray  # (band,) >= 0
+    air_db_per_m: DoubleArray  # (filter band,) >= 0
     sample_rate: float
     speed_of_sound: float
     nearest_m: float
@@ -49,7 +49,7 @@ def add_still_paths(
     out: FloatArray,
 ) -> None:
     """Add to `out` (channel, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals
-    (path, 3), gains (path, band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones."""
+    (path, 3), gains (path, octave band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones."""
     ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
@@ -75,7 +75,7 @@ def add_still_paths(
                     measured = tables.triangles[triangle, corner]
                     loops.add_scaled(tables.cepstra[measured, ear], weights[corner], of_ear)
             for band in range(bands):
-                level_db = gains_db[path, band] - tables.air_db_per_m[band] * length
+                level_db = gains_db[path, min(band, gains_db.shape[1] - 1)] - tables.air_db_per_m[band] * length
                 loops.add_scaled(tables.band_cepstra[band], level_db, of_ear)
             for n in range(count):
                 of_ear[n] *= tables.orders[n]

@@ -35,7 +35,7 @@ class AmbisonicResponse:
         self._field = field
         self._finder = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
         self._waves = StillPaths(
-            no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.absorption_db_per_m
+            no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m
         )
         self._early = EarlyReflections.of(field.bundle, no_head)
 

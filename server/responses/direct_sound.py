@@ -80,7 +80,8 @@ class PathBatch(Generic[Key]):
 
 class DirectSound:
     """The direct sound in one scene, through one head or, with an `order`, as ambisonic channels in world axes;
-    `air_db_per_m` (7,) is per octave band.
+    `air_db_per_m` has a value for each
+    octave band, and may have one for the octave above.
 
     Everything here is at the sample rate of `filters`, that of a stream. `field_filters` are the same head at the rate
     of the scene's fields; by default they are `filters`.
@@ -132,7 +133,7 @@ class DirectSound:
         return cls(
             bundle.floor_plan,
             speed_of_sound=manifest.speed_of_sound,
-            air_db_per_m=manifest.air.absorption_db_per_m,
+            air_db_per_m=manifest.air.filter_db_per_m,
             filters=filters if manifest.direct_sound == "geometry" else None,
             early_reflections=EarlyReflections.of(bundle, filters),
             early_without_head=EarlyReflections.of(bundle, NoHead(filters.sample_rate)),

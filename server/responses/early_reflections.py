@@ -36,7 +36,8 @@ _Floats = npt.NDArray[np.float64]
 
 
 class EarlyReflections:
-    """First reflections in one scene, through one head; `air_db_per_m` (band,). Safe to share between threads.
+    """First reflections in one scene, through one head. `air_db_per_m` has a value for each octave band, and may have
+    one for the octave above. Safe to share between threads.
 
     Without a head, responses have one channel, or several ambisonic ones in the axes of the listener.
     """
@@ -78,7 +79,7 @@ class EarlyReflections:
             bundle.floor_plan,
             geometry.materials,
             speed_of_sound=manifest.speed_of_sound,
-            air_db_per_m=manifest.air.absorption_db_per_m,
+            air_db_per_m=manifest.air.filter_db_per_m,
             filters=filters,
             transmission=manifest.transmission,
         )
@@ -112,7 +113,8 @@ class EarlyReflections:
         emitter (3,)."""
         # A path is the same in both directions, and here many listeners share one emitter.
         found = self._finder.find(emitter, listeners)
-        levels_db = found.gain_db - found.length_m[:, None] * self._air_db_per_m
+        air_db_per_m = self._air_db_per_m[: len(OCTAVE_BANDS_HZ)]
+        levels_db = found.gain_db - found.length_m[:, None] * air_db_per_m
         power = np.zeros((len(listeners), levels_db.shape[-1]))
         spread = np.maximum(found.length_m, NEAR_LIMIT_M)[:, None] ** 2
         np.add.at(power, found.emitter, db_to_power(levels_db) / spread)

@@ -34,7 +34,9 @@ class FullResponse:
         self._filters = filters
         self._air_db_per_m = manifest.air.absorption_db_per_m
         self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
-        self._direct = StillPaths(filters, speed_of_sound=manifest.speed_of_sound, air_db_per_m=self._air_db_per_m)
+        self._direct = StillPaths(
+            filters, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m
+        )
         self._early = EarlyReflections.of(field.bundle, filters)
 
     @classmethod

@@ -39,7 +39,7 @@ def mono_responses(
         return responses
     no_head = NoHead(field.sample_rate)
     finder = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
-    waves = StillPaths(no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.absorption_db_per_m)
+    waves = StillPaths(no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m)
     early = EarlyReflections.of(field.bundle, no_head)
     for response, listener, emitter, orientation in zip(
         responses, listeners, emitters, orientations_of(heads), strict=True

@@ -25,7 +25,7 @@ from pydantic import (
 )
 
 from server.acoustics.air import absorption_db_per_m
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
@@ -74,8 +74,16 @@ class Air(Strict):
     @property
     def absorption_db_per_m(self) -> npt.NDArray[np.float64]:
         """(band,) absorption at OCTAVE_BANDS_HZ."""
+        return self._absorption_db_per_m(OCTAVE_BANDS_HZ)
+
+    @property
+    def filter_db_per_m(self) -> npt.NDArray[np.float64]:
+        """(band,) absorption at FILTER_BANDS_HZ, for filters of paths."""
+        return self._absorption_db_per_m(FILTER_BANDS_HZ)
+
+    def _absorption_db_per_m(self, frequencies_hz: tuple[float, ...]) -> npt.NDArray[np.float64]:
         return absorption_db_per_m(
-            OCTAVE_BANDS_HZ, temperature_c=self.temperature_c, relative_humidity=self.relative_humidity
+            frequencies_hz, temperature_c=self.temperature_c, relative_humidity=self.relative_humidity
         )
 
 

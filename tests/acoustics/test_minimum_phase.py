@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, minimum_phase, tf2zpk
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.air import absorption_db_per_m
+from server.acoustics.bands import FILTER_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.minimum_phase import band_cepstra, excess_delays_samples, folded_cepstrum
+from server.rendering.hrtf import filter_taps
 
 
 def test_the_cepstrum_of_poles_and_zeros_is_their_power_sums():
@@ -49,11 +51,11 @@ def kemar_pair():
     return hrtf.impulse_responses[np.argmax(hrtf.directions @ [0.5, 0.8, 0.2])]
 
 
-@pytest.mark.parametrize("sample_rate", [16_000, 24_000, 48_000])
+@pytest.mark.parametrize("sample_rate", [16_000, 24_000, 48_000, 96_000])
 def test_band_cepstra_meet_the_gains_at_the_centres_and_are_flat_beyond(sample_rate):
     taps = round(0.004 * sample_rate)
-    audible = [band for band in OCTAVE_BANDS_HZ if band < sample_rate / 2]
-    gains = np.array([-9, -6, -3, 0, -3, -6, -9.0])
+    audible = [band for band in FILTER_BANDS_HZ if band < sample_rate / 2]
+    gains = np.array([-9, -6, -3, 0, -3, -6, -9.0, -9.0])
     log_magnitude = np.fft.rfft(gains @ band_cepstra(sample_rate, taps), 2**14).real
     frequency = np.fft.rfftfreq(2**14, 1 / sample_rate)
     at = np.interp([1.0, *audible, 0.49 * sample_rate], frequency, 20 / np.log(10) * log_magnitude)
@@ -63,8 +65,23 @@ def test_band_cepstra_meet_the_gains_at_the_centres_and_are_flat_beyond(sample_r
     assert at[-1] == pytest.approx(gains[-1], abs=0.6)
 
 
+@pytest.mark.parametrize("sample_rate", [24_000, 44_100, 96_000])
+def test_filters_of_air_are_the_same_at_all_rates(sample_rate):
+    """Their level below 10 kHz is; their delay after 10 m to 3 us, since the minimum phase is that of all the band."""
+    lost_db = 10 * absorption_db_per_m(np.array(FILTER_BANDS_HZ))
+    frequency = np.linspace(500, 10_000, 20)
+
+    def log_response(rate):
+        cepstrum = -lost_db @ band_cepstra(rate, filter_taps(rate))
+        return np.exp(-2j * np.pi * np.outer(frequency / rate, np.arange(cepstrum.size))) @ cepstrum
+
+    apart = log_response(sample_rate) - log_response(48_000)
+    assert np.abs(20 / np.log(10) * apart.real).max() < 0.02
+    assert np.abs(apart.imag / (2 * np.pi * frequency)).max() < 3e-6
+
+
 def test_one_level_in_all_bands_is_a_gain():
-    log_magnitude = np.fft.rfft(np.full(7, -20.0) @ band_cepstra(48_000, 192), 4096).real
+    log_magnitude = np.fft.rfft(np.full(8, -20.0) @ band_cepstra(48_000, 192), 4096).real
     np.testing.assert_allclose(20 / np.log(10) * log_magnitude, -20, atol=1e-6)
 
 

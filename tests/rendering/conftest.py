@@ -69,7 +69,7 @@ def make_path(kemar_at):
             sample_rate=sample_rate,
             filters=filters,
             speed_of_sound=SPEED_OF_SOUND,
-            air_db_per_m=np.broadcast_to(air_db_per_m, 7),
+            air_db_per_m=np.full(7, air_db_per_m) if np.ndim(air_db_per_m) == 0 else air_db_per_m,
             **rest,
         )
 

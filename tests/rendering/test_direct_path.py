@@ -8,7 +8,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from server.acoustics.air import absorption_db_per_m
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ, in_filter_bands
 from server.acoustics.decibels import amplitude_to_db, power_to_db
 from server.rendering.direct_path import NEAR_LIMIT_M, PathTarget
 
@@ -72,18 +72,24 @@ def test_pressure_falls_with_distance_down_to_the_near_limit(make_path):
         assert level / rms[1.0] == pytest.approx(1 / max(length, NEAR_LIMIT_M), rel=2e-3)
 
 
-@pytest.mark.parametrize("sample_rate", [24_000, 48_000])
-def test_air_takes_what_the_standard_says(make_path, sample_rate):
-    air = absorption_db_per_m(np.array(OCTAVE_BANDS_HZ))
+@pytest.mark.parametrize(("sample_rate", "bands_hz"), [(24_000, OCTAVE_BANDS_HZ), (48_000, FILTER_BANDS_HZ)])
+def test_air_takes_what_the_standard_says(make_path, sample_rate, bands_hz):
+    air = absorption_db_per_m(np.array(bands_hz))
     path = make_path(sample_rate=sample_rate, air_db_per_m=air)
     dry = make_path(sample_rate=sample_rate)
     samples = sample_rate // 2
     for length_m in (10.0, 100.0):
         lost = amplitude_to_db(
-            np.abs(spectrum(dry.impulse_response(at(length_m), LEVEL, samples), OCTAVE_BANDS_HZ, sample_rate))
-            / np.abs(spectrum(path.impulse_response(at(length_m), LEVEL, samples), OCTAVE_BANDS_HZ, sample_rate))
+            np.abs(spectrum(dry.impulse_response(at(length_m), LEVEL, samples), bands_hz, sample_rate))
+            / np.abs(spectrum(path.impulse_response(at(length_m), LEVEL, samples), bands_hz, sample_rate))
         )
         np.testing.assert_allclose(lost, np.stack([air * length_m] * 2), atol=0.25)
+
+
+@pytest.mark.parametrize("bands", [6, 9])
+def test_air_has_a_value_for_each_band(bands):
+    with pytest.raises(ValueError, match="air_db_per_m must have a value for each octave band"):
+        in_filter_bands(np.zeros(bands))
 
 
 @pytest.mark.parametrize("sample_rate", [24_000, 48_000])

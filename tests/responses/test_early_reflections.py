@@ -41,7 +41,7 @@ def images(emitter):
 
 def free_field(bundle, filters, places, listener, gain_db):
     """(2, sample) of emitters at `places` (n, 3)."""
-    paths = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=bundle.manifest.air.absorption_db_per_m)
+    paths = StillPaths(filters, speed_of_sound=343.0, air_db_per_m=bundle.manifest.air.filter_db_per_m)
     offsets = places - listener.position
     lengths = np.linalg.norm(offsets, axis=-1)
     gains = np.broadcast_to(np.reshape(gain_db, (-1, 1)), (len(places), 7))

@@ -12,8 +12,10 @@ const PHASES = 256;
 const KAISER_BETA = 10;
 const FILTER_S = 0.004;
 const TAPS_MULTIPLE = 8;
+/** The bands of filters: the last is known of the air alone, and surfaces are there as in the one below. */
+const FILTER_BANDS_HZ = [...OCTAVE_BANDS_HZ, 16000];
 
-/** Decibels per metre that air absorbs in each octave band, by ISO 9613-1. */
+/** Decibels per metre that air absorbs in each band of filters, by ISO 9613-1. */
 export function absorptionDbPerM({ temperature_c: celsius = 20, relative_humidity: humidity = 0.5 } = {}) {
   const kelvin = celsius + 273.15;
   const warmth = kelvin / 293.15;
@@ -21,7 +23,7 @@ export function absorptionDbPerM({ temperature_c: celsius = 20, relative_humidit
   const vapour = Math.min(100, 100 * humidity * saturation);
   const oxygenHz = 24 + (4.04e4 * vapour * (0.02 + vapour)) / (0.391 + vapour);
   const nitrogenHz = (9 + 280 * vapour * Math.exp(-4.17 * (warmth ** (-1 / 3) - 1))) / warmth ** 0.5;
-  return OCTAVE_BANDS_HZ.map((frequency) => {
+  return FILTER_BANDS_HZ.map((frequency) => {
     const classical = 1.84e-11 * warmth ** 0.5;
     const oxygen = (0.01275 * Math.exp(-2239.1 / kelvin)) / (oxygenHz + frequency ** 2 / oxygenHz);
     const nitrogen = (0.1068 * Math.exp(-3352 / kelvin)) / (nitrogenHz + frequency ** 2 / nitrogenHz);
@@ -29,11 +31,11 @@ export function absorptionDbPerM({ temperature_c: celsius = 20, relative_humidit
   });
 }
 
-/** Weights of a frequency in the octave bands, linear over the logarithm of frequency; they add up to one. */
-export function bandWeights(frequency) {
-  const last = OCTAVE_BANDS_HZ.length - 1;
-  const octave = Math.min(last, Math.max(0, Math.log2(Math.max(frequency, 1) / OCTAVE_BANDS_HZ[0])));
-  return OCTAVE_BANDS_HZ.map((_, band) => Math.max(0, 1 - Math.abs(octave - band)));
+/** Weights of a frequency in bands an octave apart, linear over the logarithm of frequency; they add up to one. */
+export function bandWeights(frequency, centresHz = OCTAVE_BANDS_HZ) {
+  const last = centresHz.length - 1;
+  const octave = Math.min(last, Math.max(0, Math.log2(Math.max(frequency, 1) / centresHz[0])));
+  return centresHz.map((_, band) => Math.max(0, 1 - Math.abs(octave - band)));
 }
 
 /** Solves matrix x = columns by elimination, in place; rows are arrays. */
@@ -54,27 +56,34 @@ function solve(matrix, right) {
   right.forEach((row, pivot) => row.forEach((value, k) => (row[k] = value / matrix[pivot][pivot])));
 }
 
-/** [band][tap] folded cepstra of a gain of one decibel in each octave band, exact at the centres of the bands. */
+/** [band][tap] folded cepstra of a gain of one decibel in each band of filters, exact at the centres of the bands. */
 function bandCepstra(sampleRate, taps) {
   const nepers = Math.LN10 / 20;
   let size = 1;
   while (size < 64 * taps) size *= 2;
-  const cepstra = OCTAVE_BANDS_HZ.map((_, band) => {
+  const cepstra = FILTER_BANDS_HZ.map((_, band) => {
     const [re, im] = [new Float64Array(size), new Float64Array(size)];
-    for (let i = 0; i <= size / 2; i++) re[i] = re[(size - i) % size] = nepers * bandWeights((i * sampleRate) / size)[band];
+    for (let i = 0; i <= size / 2; i++) re[i] = re[(size - i) % size] = nepers * bandWeights((i * sampleRate) / size, FILTER_BANDS_HZ)[band];
     inverse(re, im);
     return re.slice(0, taps).map((value, n) => (n === 0 ? value : 2 * value));
   });
-  const audible = OCTAVE_BANDS_HZ.flatMap((centre, band) => (centre < sampleRate / 2 ? [band] : []));
-  const atCentres = audible.map((band) =>
+  const audible = FILTER_BANDS_HZ.flatMap((centre, band) => (centre < sampleRate / 2 ? [band] : []));
+  const atCentres = FILTER_BANDS_HZ.map((_, band) =>
     audible.map((other) => {
-      const turn = (2 * Math.PI * OCTAVE_BANDS_HZ[other]) / sampleRate;
+      const turn = (2 * Math.PI * FILTER_BANDS_HZ[other]) / sampleRate;
       return cepstra[band].reduce((sum, value, n) => sum + value * Math.cos(turn * n), 0) / nepers;
     }),
   );
   const mixed = audible.map((band) => cepstra[band]);
-  solve(atCentres, mixed);
+  solve(
+    audible.map((band) => [...atCentres[band]]),
+    mixed,
+  );
   audible.forEach((band, i) => (cepstra[band] = mixed[i]));
+  FILTER_BANDS_HZ.forEach((centre, band) => {
+    if (centre < sampleRate / 2) return;
+    mixed.forEach((ofBand, i) => ofBand.forEach((value, n) => (cepstra[band][n] -= atCentres[band][i] * value)));
+  });
   return cepstra;
 }
 
@@ -115,11 +124,11 @@ export class PlaneWaves {
     this.#cepstra = bandCepstra(sampleRate, this.taps);
   }
 
-  /** The minimum-phase filter of a path: surfaces or edges (`gainDb`, per band), air, and distance. */
+  /** The minimum-phase filter of a path: surfaces or edges (`gainDb`, per octave band), air, and distance. */
   filter({ lengthM, gainDb }) {
     const cepstrum = new Float64Array(this.taps);
     this.#cepstra.forEach((ofBand, band) => {
-      const level = gainDb[band] - this.#airDbPerM[band] * lengthM;
+      const level = gainDb[Math.min(band, gainDb.length - 1)] - this.#airDbPerM[band] * lengthM;
       for (let n = 0; n < cepstrum.length; n++) cepstrum[n] += level * ofBand[n];
     });
     const filter = new Float64Array(this.taps);
