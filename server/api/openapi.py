@@ -61,8 +61,16 @@ _PROBLEM: Final[Object] = {
 }
 _OF_A_BODY: Final = {"415": "The body is of another type than the route reads."}
 _COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/plan", "/ambisonic-noises")
-_TAGGED: Final = ("/impulse-response", "/loudness", "/plan", "/decoder", "/bundle/{file}", "/ambisonic-noises")
-_RANGED: Final = "/bundle/{file}"
+_TAGGED: Final = (
+    "/impulse-response",
+    "/loudness",
+    "/plan",
+    "/decoder",
+    "/bundle/{file}",
+    "/ambisonic-noises",
+    "/audio",
+)
+_RANGED: Final = ("/bundle/{file}", "/audio")
 _OF_A_RANGE: Final = {"416": "The file ends before the range that is asked for."}
 _PART: Final = {"206": {"description": "The part that `Range` asks for."}}
 

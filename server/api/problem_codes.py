@@ -6,7 +6,7 @@ from typing import Final
 PROBLEM_CODES: Final[Mapping[str, str]] = {
     "answer_too_long": "409: so many responses of this scene and output are more than the server sends at once",
     "body_too_large": "413: the body is longer than the server takes",
-    "bundle_not_offered": "403: the server does not give its scene bundles away",
+    "bundle_not_offered": "403: the server does not give its scene bundles and the files of clips away",
     "clip_too_long": "422: an uploaded clip lasts longer, or has more channels, than the server takes",
     "clips_full": "507: uploaded clips take all the room they may; delete some, or wait until some expire",
     "contradicting_parameters": "409: two parameters contradict each other; leave one out",

@@ -1,6 +1,7 @@
 """HTTP and WebSocket endpoints. Angles are in degrees and positions in metres."""
 
 import json
+import pathlib
 from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import asdict
 from functools import cache, partial
@@ -103,6 +104,7 @@ _BATCH_BODY = {
 _FILE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
 _FILE_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
 _NOISE_TYPES = {"content": {"application/octet-stream": _IR_TYPES["content"]["audio/wav"]}}
+_CLIP_TYPES = _NOISE_TYPES
 _SCHEMA_TYPES: dict[str, Any] = {"content": {"application/schema+json": {"schema": {"type": "object"}}}}
 _BYTES = "application/octet-stream"
 _FILE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
@@ -492,6 +494,33 @@ async def one_clip(request: Request, clip: str) -> Clip:
     if clip not in named:
         raise UnknownClipError(clip)
     return named[clip]
+
+
+@api.get("/clips/{clip}/audio", response_class=Response, responses={200: _CLIP_TYPES})
+async def clip_audio(request: Request, clip: str) -> Response:
+    """The sound file of a clip, or a part of it (`Range`): for programs that render a scene themselves."""
+    host = _host(request)
+    if not host.settings.offer_bundles:
+        raise RequestError("bundle_not_offered", "this server does not give its sound files away", status=403)
+    file = await anyio.to_thread.run_sync(_clip_file, host, clip)
+    try:
+        stat_result = await anyio.to_thread.run_sync(file.stat)
+    except OSError as exc:
+        raise UnknownClipError(clip) from exc  # it is gone meanwhile
+    tag = computed_tag("clip", clip, stat_result.st_size, stat_result.st_mtime_ns)
+    headers = {"ETag": tag, "Cache-Control": CACHE_CONTROL, "X-Content-Type-Options": "nosniff"}
+    if _has_tag(request.headers.get("if-none-match", ""), tag):
+        return Response(status_code=304, headers=headers)
+    return RangedFile(file, headers=headers, media_type=_BYTES, stat_result=stat_result)
+
+
+def _clip_file(host: StreamHost, clip: str) -> pathlib.Path:
+    if host.clip_store is not None and is_upload(clip):
+        return host.clip_store.file(clip)
+    for library in set(host.clips.values()):
+        if clip in library.names:
+            return library.file(clip)
+    raise UnknownClipError(clip)
 
 
 @api.delete("/clips/{clip}", status_code=204)

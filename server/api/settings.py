@@ -108,7 +108,8 @@ class Settings(BaseSettings):
     bundles: Paths = ()
     """Scene bundles to serve besides those that come with the package."""
     offer_bundles: bool = True
-    """Whether clients may read the files of scene bundles, trained fields included, to compute responses themselves."""
+    """Whether clients may read the files of scene bundles, trained fields included, and of clips, to render scenes
+    themselves."""
     bundle_folder: Path | None = None
     """Folder whose sub-folders are scene bundles too. Bundles that come, change or go are loaded, replaced or dropped
     while the server runs; streams that are open finish with what they have."""

@@ -179,6 +179,11 @@ class ClipStore:
         expires = datetime.fromtimestamp(uploaded_s + self._expires_s, UTC)
         return Clip(name, title, duration_s, "", expires_at=expires.isoformat(timespec="seconds"))
 
+    def file(self, name: str) -> Path:
+        """The file of a clip. Raises UnknownClipError."""
+        self.describe(name)
+        return self._sound(name)
+
     def load(self, name: str, sample_rate: int) -> DryAudio:
         """The clip at a sample rate. One is decoded at a time, and kept while there is room. Raises UnknownClipError,
         and DecodeError for a file that somebody has damaged."""

@@ -134,7 +134,7 @@ class ClipLibrary:
 
     def load(self, name: str) -> DryAudio:
         """Raises UnknownClipError and DecodeError."""
-        path = self._path(name)
+        path = self.file(name)
         with self._lock:
             if name not in self._decoded:
                 self._decoded[name] = decode(path, self.sample_rate)
@@ -142,11 +142,12 @@ class ClipLibrary:
 
     def describe(self, name: str) -> Clip:
         """Raises UnknownClipError and DecodeError."""
-        self._path(name)
+        self.file(name)
         labels = self._labels[name]
         return Clip(name, labels["title"], self.load(name).size / self.sample_rate, labels["credit"])
 
-    def _path(self, name: str) -> Path:
+    def file(self, name: str) -> Path:
+        """The file of a clip, as it was given. Raises UnknownClipError."""
         try:
             return self._paths[name]
         except KeyError:

@@ -295,11 +295,25 @@ def test_a_file_of_a_bundle_is_sent_once_and_in_parts(shared_client, bundle):
     check_problem(shared_client.get("/v1/scenes/flat/bundle/a.onnx"), 404, "unknown_file", "file")
 
 
+def test_the_sound_of_a_clip_is_sent_as_it_is_stored(shared_client):
+    path = "/v1/clips/trumpet/audio"
+    answer = shared_client.get(path)
+    samples, rate = soundfile.read(io.BytesIO(answer.content))
+    assert len(samples) / rate == pytest.approx(shared_client.get("/v1/clips/trumpet").json()["duration_s"], abs=0.01)
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert shared_client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    part = shared_client.get(path, headers={"Range": "bytes=5-9"})
+    assert (part.status_code, part.content) == (206, answer.content[5:10])
+    for name in ("kazoo", "upload-0f1e2d3c4b5a69788796a5b4c3d2e1f0", "..%2Fclips"):
+        assert shared_client.get(f"/v1/clips/{name}/audio").status_code == 404
+
+
 def test_bundles_are_kept_where_an_operator_says_so(field, hrtfs):
     settings = Settings(offer_bundles=False)
     with TestClient(create_app(settings, scenes={"flat": FieldsByLevel([field])}, hrtfs=hrtfs)) as client:
         for path in ("bundle", "bundle/scene.json"):
             check_problem(client.get(f"/v1/scenes/flat/{path}"), 403, "bundle_not_offered")
+        check_problem(client.get("/v1/clips/trumpet/audio"), 403, "bundle_not_offered")
 
 
 def test_the_schema_of_bundles_is_published(shared_client):

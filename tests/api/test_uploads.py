@@ -2,11 +2,13 @@
 
 import asyncio
 import errno
+import io
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from starlette.requests import ClientDisconnect
 from starlette.testclient import TestClient
 
@@ -71,6 +73,8 @@ def test_a_file_becomes_a_clip(client, kind):
     assert answer.headers["location"] == f"/v1/clips/{clip['name']}"
     assert clip in client.get("/v1/clips").json()["clips"]
     assert client.get(answer.headers["location"]).json() == clip
+    sound = client.get(f"{answer.headers['location']}/audio").content
+    assert soundfile.info(io.BytesIO(sound)).duration == pytest.approx(clip["duration_s"], abs=0.001)
     head = client.head(answer.headers["location"])
     assert (head.status_code, head.content) == (200, b"")
 

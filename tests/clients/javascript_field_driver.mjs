@@ -10,15 +10,20 @@ const load = (name) => import(pathToFileURL(join(folder, "field", name)).href);
 const { Field, readRows } = await load("field.js");
 const { Network } = await load("network.js");
 const { inverse, transform } = await load("fourier.js");
+const { LocalStream, BLOCK } = await load("local_stream.js");
+const { spectraOf } = await load("renderer.js");
 const bytesOf = (path) => new Uint8Array(readFileSync(path));
 
-function respond({ bundle, graph, noises, level, poses, into }) {
-  const field = new Field({
+const open = ({ bundle, graph, noises, level }) =>
+  new Field({
     manifest: JSON.parse(readFileSync(join(bundle, "scene.json"), "utf8")),
     level: level ?? undefined,
     graph: graph && bytesOf(join(bundle, graph)),
     noises: noises && readRows(bytesOf(noises)),
   });
+
+function respond({ poses, into, ...opened }) {
+  const field = open(opened);
   const samples = new Float32Array(poses.length * 4 * field.samples);
   poses.forEach(({ listener, emitter, orientation }, i) => {
     field.response(listener, emitter, orientation ?? null).forEach((channel, k) => samples.set(channel, (4 * i + k) * field.samples));
@@ -41,7 +46,71 @@ function spectrum({ re, im }) {
   return { there, back: [Array.from(a), Array.from(b)] };
 }
 
-const TASKS = { respond, run, spectrum };
+/** A field_worker.js that answers at once. */
+function answerer(field, stream) {
+  return ({ type, id, poseId, listener, emitter }) => {
+    if (type === "open") {
+      const longestS = field.longestM / field.speedOfSound;
+      stream().receive({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS });
+    }
+    if (type !== "place") return;
+    try {
+      field.requireInside(listener, "listener");
+      field.requireInside(emitter, "emitter");
+    } catch (error) {
+      stream().receive({ type: "refused", id, message: error.message });
+      return;
+    }
+    const { lengthM, arrival: [x, y, z], gainDb } = field.directPath(listener, emitter);
+    const filter = field.directFilter({ lengthM, gainDb });
+    const delay = (lengthM / field.speedOfSound) * field.sampleRate;
+    stream().receive({ type: "path", id, poseId, path: { delay, filter, gains: [1, y, z, x] } });
+    stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), BLOCK), ms: 1 });
+  };
+}
+
+/** Renders blocks; `script` has the commands before a block, by its number. The clip is a file of float32. */
+function stream({ blocks, script, clip, into, ...opened }) {
+  const field = open(opened);
+  const told = { posed: [], refused: [], state: [], status: [], heard: [] };
+  const samples = new Float32Array(4 * blocks * BLOCK);
+  let time = 1000;
+  let rendered = 0;
+  const block = ({ channels, poseId, reverberationPoseId, late }) => {
+    told.heard.push([poseId, reverberationPoseId, late]);
+    channels.forEach((channel, k) => samples.set(channel, k * blocks * BLOCK + rendered * BLOCK));
+    rendered += 1;
+  };
+  const keep = (name) => (detail) => told[name].push(detail);
+  const listeners = { block, posed: keep("posed"), refused: keep("refused"), state: keep("state"), status: keep("status") };
+  let local = null;
+  const waiting = [];
+  const answer = answerer(field, () => local);
+  const { listener } = script[0][0];
+  const hello = { scene: "any", sampleRate: field.sampleRate };
+  local = new LocalStream({
+    server: "http://any", hello, listener: { ...listener, at: time }, emitters: [], listeners, now: () => time,
+    tell: (message) => (local ? answer(message) : waiting.push(message)),
+  });
+  waiting.forEach(answer);
+  if (clip) local.setSound({ name: "clip", samples: new Float32Array(bytesOf(clip).buffer) });
+  for (let number = 0; number < blocks; number++) {
+    for (const { listener: moved, emitter, remove, feed, wait } of script[number] ?? []) {
+      if (moved) local.setListener({ ...moved, at: time });
+      if (emitter) local.setEmitter({ ...emitter, at: time });
+      if (remove) local.removeEmitter(remove);
+      if (feed) local.feed(feed.id, Float32Array.from(feed.samples));
+      if (wait) time += wait;
+    }
+    local.tick();
+    time += (1000 * BLOCK) / field.sampleRate;
+    if (rendered >= blocks) break;
+  }
+  writeFileSync(into, samples);
+  return { ...told, block: BLOCK, rendered };
+}
+
+const TASKS = { respond, run, spectrum, stream };
 const results = JSON.parse(readFileSync(jobFile, "utf8")).map(({ task, ...job }) => {
   try {
     return TASKS[task](job);

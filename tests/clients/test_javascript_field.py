@@ -322,3 +322,137 @@ def test_transforms_of_any_length_are_discrete_fourier_transforms(work, length):
     wanted = np.fft.fft(signal[0] + 1j * signal[1])
     np.testing.assert_allclose(np.array(said["there"]), [wanted.real, wanted.imag], atol=1e-10)
     np.testing.assert_allclose(np.array(said["back"]), signal, atol=1e-13)
+
+
+HERE_AND_THERE = ((2.0, 2.0, 1.5), (3.0, 3.5, 1.4), (6.2, 3.2, 1.5))
+"""Two places of a listener and one of an emitter, around the corner."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a stream said, and the samples (channel, sample) of its blocks."""
+
+    said: dict[str, Any]
+    samples: np.ndarray
+
+
+@pytest.fixture
+def render(work, tmp_path):
+    """Renders blocks of the apartment by a script: commands by the number of the block that is the first to have
+    them."""
+    bundle = Bundle.load(find_bundle("apartment"))
+    field = AcousticField.load(bundle, level="directional-bands")
+    (tmp_path / "noises.npy").write_bytes(noise_file(field, 1))
+
+    def blocks(count: int, script: dict[int, list[dict[str, Any]]], clip: np.ndarray | None = None) -> Rendered:
+        if clip is not None:
+            clip.astype("<f4").tofile(tmp_path / "clip.f32")
+        job = {
+            "task": "stream",
+            "bundle": str(bundle.folder),
+            "graph": "directional.onnx",
+            "noises": str(tmp_path / "noises.npy"),
+            "blocks": count,
+            "script": script,
+            "clip": None if clip is None else str(tmp_path / "clip.f32"),
+            "into": str(tmp_path / "blocks.f32"),
+        }
+        [said] = work([job])
+        assert "error" not in said, said
+        return Rendered(said, np.fromfile(tmp_path / "blocks.f32", "<f4").reshape(4, -1))
+
+    blocks.response = lambda listener, emitter: AmbisonicResponse(field).impulse_responses(
+        [listener], [emitter], np.zeros(1), 1
+    )[0]
+    return blocks
+
+
+def radio(position: tuple, **options: Any) -> dict[str, Any]:
+    return {"emitter": {"id": "radio", "clip": "clip", "position": list(position), **options}}
+
+
+def standing(position: tuple) -> dict[str, Any]:
+    return {"listener": {"position": list(position)}}
+
+
+def heard_of(clip: np.ndarray, response: np.ndarray, samples: int) -> np.ndarray:
+    size = 2 ** int(np.ceil(np.log2(len(clip) + response.shape[1])))
+    return np.fft.irfft(np.fft.rfft(clip, size) * np.fft.rfft(response, size), size)[:, :samples]
+
+
+def test_a_stream_is_the_clip_through_the_servers_responses(render):
+    here, there, source = HERE_AND_THERE
+    count, block = 120, 256
+    clip = np.random.default_rng(5).standard_normal(count * block) * 0.1
+    clip[: 4 * block] = 0  # while the first path and the first response fade in
+    found = render(count, {0: [standing(here), radio(source)], 60: [standing(there)]}, clip)
+    assert found.said["block"] == block
+    before, after = (heard_of(clip, render.response(place, source), count * block) for place in (here, there))
+    changed = 60 * block
+    peak = np.abs(before).max()
+    assert np.abs(found.samples - before)[:, :changed].max() < 1e-4 * peak
+    # What has sounded before the step goes on sounding, now from the new place.
+    assert np.abs(found.samples - after)[:, changed + 3 * block :].max() < 1e-4 * peak
+    assert np.abs(before - after)[:, changed + 3 * block :].max() > 0.1 * peak
+    poses = [pose for pose, _, _ in found.said["heard"]]
+    assert poses == sorted(poses)
+    assert poses[59] < found.said["posed"][-1]["poseId"] == poses[-1]
+
+
+def test_a_walk_makes_no_click(render):
+    (x, y, z), source = (2.0, 2.5, 1.5), HERE_AND_THERE[2]
+    count, block, rate = 90, 256, 24_000
+    tone = np.sin(2 * np.pi * 200 * np.arange(count * block) / rate)
+    script = {number: [standing((x + 0.015 * number, y, z))] for number in range(1, count)}  # 1.4 m/s
+    walked = render(count, {0: [standing((x, y, z)), radio(source)], **script}, tone).samples[:, 40 * block :]
+    # The second difference of a tone is its curvature, and a step in it is a click.
+    curvature = np.abs(np.diff(walked, 2)).max(axis=1)
+    amplitude = np.abs(walked).max(axis=1)
+    # A step of a hundredth of the amplitude would be four times as much as the tone itself has.
+    assert np.all(curvature < 2.5 * amplitude * (2 * np.pi * 200 / rate) ** 2)
+
+
+def test_emitters_come_play_and_go(render):
+    here, _, source = HERE_AND_THERE
+    block = 256
+    loop = np.full(3 * block, 0.1)  # what repeats without end is constant
+    live = {"feed": {"id": "live", "samples": [0.1] * (4 * block)}}
+    script = {
+        0: [standing(here), radio(source)],
+        30: [radio(source, gainDb=-200)],
+        100: [{"emitter": {"id": "live", "position": list(source)}}, live],
+        180: [{"remove": "live"}, {"remove": "radio"}],
+    }
+    samples = render(260, script, loop).samples[0].reshape(-1, block)
+    level = np.abs(samples).max(axis=1)
+    assert level[25] > 0.01
+    assert level[99] < 1e-6 * level[25]  # the gain has become nothing, and the room has fallen silent
+    assert level[104] > 0.001  # live sound, once the direct sound has arrived
+    assert level[259] == 0
+
+
+def test_what_a_stream_refuses_is_said_and_it_goes_on(render):
+    here, _, source = HERE_AND_THERE
+    script = {
+        0: [standing(here), radio(source)],
+        20: [standing((4.1, 1.0, 1.5))],  # inside the wall
+        21: [{"emitter": {"id": f"more-{number}", "clip": "clip", "position": list(source)}} for number in range(8)],
+    }
+    found = render(40, script, np.full(256, 0.1))
+    codes = [each["code"] for each in found.said["refused"]]
+    assert codes[0] == "position_out_of_bounds"
+    assert "is not inside scene apartment" in found.said["refused"][0]["message"]
+    assert "too_many_emitters" in codes
+    assert found.said["rendered"] == 40
+    assert np.abs(found.samples[0, -256:]).max() > 0.01
+    assert found.said["heard"][-1][0] == found.said["posed"][-1]["poseId"]
+
+
+def test_blocks_that_are_much_too_late_are_left_out(render):
+    here, _, source = HERE_AND_THERE
+    script = {0: [standing(here), radio(source)], 10: [{"wait": 50}], 30: [{"wait": 5000}]}
+    found = render(160, script, np.full(256, 0.1))
+    late = [is_late for _, _, is_late in found.said["heard"]]
+    assert sum(late[10:30]) in {4, 5}  # of 50 ms: they are rendered at once
+    assert len(found.said["status"]) > 0
+    assert found.said["status"][-1]["blocks_dropped"] == pytest.approx(5 * 24_000 / 256, abs=3)

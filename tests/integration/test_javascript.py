@@ -264,3 +264,69 @@ def test_the_example_of_react_adds_and_removes_what_it_renders(visitor_of):
     page.wait_for_function("document.getElementById('state').textContent === 'closed'")
     page.wait_for_timeout(200)
     assert page.workers == []
+
+
+_CONNECT_HERE = _CONNECT.replace("48000", "24000")
+
+
+def test_a_scene_is_rendered_in_the_browser(page, server):
+    asked = []
+    page.on("request", lambda request: asked.append(request.url.removeprefix(server)))
+    page.evaluate(_CONNECT_HERE, {"scene": "apartment", "rendered": "here", "listener": {"position": [2.5, 2.0, 1.5]}})
+    page.evaluate("window.radio = nafir.addEmitter({ clip: 'woman-reading', position: [2.5, 3.0, 1.5] })")
+    page.wait_for_function("nafir.latency.reverberation !== null")
+    on_the_left = visitor.level_db(listen(page, 2.0))
+    page.evaluate("radio.position = [2.5, 1.0, 1.5]")
+    page.wait_for_timeout(1000)
+    on_the_right = visitor.level_db(listen(page, 2.0))
+    assert on_the_left.max() > -60
+    assert on_the_left[0] - on_the_left[1] > 1.5
+    assert on_the_right[1] - on_the_right[0] > 1.5
+    assert page.evaluate("refusals") == []
+    assert page.evaluate("nafir.welcome.level") == "directional-bands"
+    page.evaluate("radio.remove()")
+    page.wait_for_timeout(1500)
+    assert visitor.level_db(listen(page)).max() < -100
+    assert not any("/v1/stream" in url for url in asked)
+    assert any("/v1/clips/woman-reading/audio" in url for url in asked)
+    page.evaluate("nafir.close()")
+
+
+def test_a_browser_renders_what_the_server_does(page):
+    """The level of noise at both ears, of one source at two places in turn, within half a decibel."""
+    heard = {}
+    for rendered in ("server", "here"):
+        options = {"scene": "apartment", "order": 1, "rendered": rendered, "listener": {"position": [2.5, 2.0, 1.5]}}
+        page.evaluate(_CONNECT_HERE, options)
+        page.evaluate("""() => {
+          const buffer = new AudioBuffer({ length: 24000, sampleRate: 24000 });
+          const samples = buffer.getChannelData(0);
+          for (let i = 0, seed = 1; i < samples.length; i++) {
+            seed = (1103515245 * seed + 12345) % 2 ** 31;
+            samples[i] = 0.2 * (seed / 2 ** 30 - 1);
+          }
+          const source = new AudioBufferSourceNode(context, { buffer, loop: true });
+          window.noise = nafir.addEmitter({ source, position: [3.5, 3.0, 1.5] });
+          source.start();
+        }""")
+        page.wait_for_function("nafir.latency.reverberation !== null")
+        page.wait_for_timeout(1000)
+        near = visitor.level_db(listen(page, 2.0))
+        page.evaluate("noise.position = [6.5, 1.0, 1.5]")  # in the other room
+        page.wait_for_timeout(1500)
+        heard[rendered] = np.stack([near, visitor.level_db(listen(page, 2.0))])
+        page.evaluate("nafir.close(); context.close()")
+    np.testing.assert_allclose(heard["here"], heard["server"], atol=0.5)
+
+
+def test_a_scene_that_a_browser_cannot_render_is_refused_in_words(page):
+    said = page.evaluate("""async () => {
+      const context = new AudioContext({ sampleRate: 48000 });
+      const connect = (options) => package.connect(context, location.origin, options).catch((error) => error.message);
+      return [
+        await connect({ scene: "apartment", rendered: "here" }),
+        await connect({ scene: "apartment", rendered: "here", level: "factorised-r16-100cm-120deg" }),
+      ];
+    }""")
+    assert "has 24000 Hz: open the AudioContext with this rate" in said[0]
+    assert "does not know from where sound arrives" in said[1]

@@ -22,8 +22,7 @@ export function authorized(options = {}, key = null) {
   return key === null ? options : { ...options, headers: { ...options.headers, Authorization: `Bearer ${key}` } };
 }
 
-/** What the server says at `url`. Throws RequestError if it refuses or cannot be reached, and AbortError if `options.signal` says so. */
-export async function fetchJson(url, { key = null, ...options } = {}) {
+async function answered(url, { key = null, ...options }) {
   let response;
   try {
     response = await fetch(url, authorized(options, key));
@@ -31,13 +30,19 @@ export async function fetchJson(url, { key = null, ...options } = {}) {
     if (error.name === "AbortError") throw error;
     throw new RequestError("The server cannot be reached.");
   }
-  if (response.ok) return response.json();
+  if (response.ok) return response;
   const problem = await response.json().catch(() => ({}));
   throw new RequestError(problem.detail || problem.title || `The server answered ${response.status}.`, {
     code: problem.code,
     status: response.status,
   });
 }
+
+/** What the server says at `url`. Throws RequestError if it refuses or cannot be reached, and AbortError if `options.signal` says so. */
+export const fetchJson = async (url, options = {}) => (await answered(url, options)).json();
+
+/** The file at `url` as a Uint8Array. Throws as fetchJson. */
+export const fetchBytes = async (url, options = {}) => new Uint8Array(await (await answered(url, options)).arrayBuffer());
 
 /** Where the filters are by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. `base` is the
     address of v1/. */

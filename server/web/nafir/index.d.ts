@@ -154,6 +154,8 @@ export interface ConnectOptions {
   encoding?: "f32" | "s16" | "opus";
   opus?: OpusOptions;
   bufferBlocks?: number;
+  /** "here": the field runs in this browser, in ambisonics of the first order, in a context of the scene's own rate. */
+  rendered?: "server" | "here";
   /** Ends the attempt. */
   signal?: AbortSignal;
   /** Where this package's files are, for bundlers that move them. */

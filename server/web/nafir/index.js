@@ -7,6 +7,7 @@
 //
 // Positions are [x, y, z] in metres (x east, y north, z up), orientations quaternions [x, y, z, w] whose identity looks along +x.
 
+import { LocalWorkerStream } from "./field/local_worker_stream.js";
 import { apiOf, decoderUrl, fetchJson } from "./http.js";
 import { PoseLedger } from "./latency.js";
 import { decodesOpus } from "./opus.js";
@@ -287,10 +288,12 @@ class Nafir extends EventTarget {
  * `listener` ({position, yaw or orientation}; without it, where a visit of the scene begins); `level`; `effects`; `head`; `order` (1 to 3:
  * the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32"; "s16", half as many bytes; or "opus", a tenth,
  * which is "s16" where server, browser or rate do not allow it: `welcome.encoding` says so); `opus` (its options); `bufferBlocks`;
- * `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
+ * `rendered` ("here": the field runs in this browser, in first-order ambisonics at the scene's own rate, and the server has nothing more to
+ * do; only levels whose field knows directions can); `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
  */
 export async function connect(context, url, options) {
-  const { key = null, signal, assets, listener } = options;
+  const { key = null, signal, assets, listener, rendered = "server" } = options;
+  const isHere = rendered === "here";
   const api = apiOf(url);
   const at = (name) => new URL(name, new URL(assets, globalThis.location?.href));
   const [sound, encoding, scene] = await Promise.all([
@@ -299,9 +302,12 @@ export async function connect(context, url, options) {
     listener === undefined ? fetchJson(new URL(`scenes/${encodeURIComponent(options.scene)}`, api), { key, signal }) : null,
   ]);
   const start = { position: [0, 0, 0], ...(scene?.listener ?? {}), ...listener };
-  const worker = assets === undefined ? undefined : new Worker(at("stream_worker.js"), { type: "module" });
+  const file = isHere ? "field/stream_worker.js" : "stream_worker.js";
+  const worker = assets === undefined ? undefined : new Worker(at(file), { type: "module" });
+  const stream = isHere ? new LocalWorkerStream(worker) : new WorkerStream(worker);
   const opus = encoding === "opus" ? options.opus : undefined;
-  const nafir = new Nafir(context, api, { ...options, encoding, opus, listener: start }, sound, new WorkerStream(worker));
+  const order = isHere ? 1 : options.order;
+  const nafir = new Nafir(context, api, { ...options, order, encoding, opus, listener: start }, sound, stream);
   return nafir.open(signal);
 }
 

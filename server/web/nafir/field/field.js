@@ -8,7 +8,7 @@
 // orientations quaternions [x, y, z, w].
 
 import { rotation } from "../ambisonics.js";
-import { apiOf, authorized, fetchJson, RequestError } from "../http.js";
+import { apiOf, fetchBytes, fetchJson } from "../http.js";
 import { BandNoises } from "./band_noises.js";
 import { FloorPlan, OCTAVE_BANDS_HZ } from "./floor_plan.js";
 import { Gate } from "./gate.js";
@@ -42,21 +42,6 @@ function levelOf({ id, levels, fields, direct_sound: directSound }, name) {
   if (!found) throw new Error(name === undefined ? `scene ${id} has no field that knows directions` : `scene ${id} has no level ${name}`);
   if (!knows(found)) throw new Error(`level ${found.name} of scene ${id} does not know from where sound arrives`);
   return found;
-}
-
-async function fetchBytes(url, { key, signal }) {
-  let response;
-  try {
-    response = await fetch(url, authorized({ signal }, key));
-  } catch (error) {
-    if (error.name === "AbortError") throw error;
-    throw new RequestError("The server cannot be reached.");
-  }
-  if (!response.ok) {
-    const problem = await response.json().catch(() => ({}));
-    throw new RequestError(problem.detail || `The server answered ${response.status}.`, { code: problem.code, status: response.status });
-  }
-  return new Uint8Array(await response.arrayBuffer());
 }
 
 /** The rows of a NumPy file of float32. */
@@ -161,6 +146,16 @@ export class Field {
     }
     if (this.#wallLossDb) this.#addThroughWalls(listener, emitter, channels);
     return channels;
+  }
+
+  /** How many taps `directFilter` has. */
+  get filterTaps() {
+    return this.#waves.taps;
+  }
+
+  /** No direct path is longer than this: it passes no corner twice. */
+  get longestM() {
+    return this.#plan.longestM;
   }
 
   /** The filter of the direct sound: minimum phase, with its gain by distance. */

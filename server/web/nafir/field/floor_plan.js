@@ -49,6 +49,13 @@ export class FloorPlan {
     }
   }
 
+  /** An upper bound of the length of paths within the walls: from end to end along the bends, and the room's diagonal at both ends. */
+  get longestM() {
+    const spread = (axis) => Math.max(...this.corners.map((corner) => corner[axis])) - Math.min(...this.corners.map((corner) => corner[axis]));
+    const bent = Math.max(0, ...this.#bendLengths.flat().filter(Number.isFinite));
+    return bent + 2 * Math.hypot(spread(0), spread(1), this.height - this.floor);
+  }
+
   #apart(one, other) {
     return this.sees(one, other) ? Math.hypot(other[0] - one[0], other[1] - one[1]) : Infinity;
   }

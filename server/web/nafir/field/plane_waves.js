@@ -6,9 +6,9 @@ import { OCTAVE_BANDS_HZ } from "./floor_plan.js";
 import { realHarmonics } from "../ambisonics.js";
 
 const NEAR_LIMIT_M = 0.25; // nearer sources are no louder
-const SINC_TAPS = 32;
-const BEFORE = SINC_TAPS / 2 - 1;
-const PHASES = 256;
+export const SINC_TAPS = 32;
+export const BEFORE = SINC_TAPS / 2 - 1;
+export const PHASES = 256;
 const KAISER_BETA = 10;
 const FILTER_S = 0.004;
 const TAPS_MULTIPLE = 8;
@@ -97,7 +97,7 @@ function besselI0(x) {
 }
 
 /** [phase][tap] windowed sincs that read a signal between its samples; one phase more than PHASES, to interpolate to. */
-function sincTable() {
+export function sincTable() {
   return Array.from({ length: PHASES + 1 }, (_, phase) => {
     const row = Array.from({ length: SINC_TAPS }, (_, tap) => {
       const offset = tap - BEFORE - phase / PHASES;

@@ -1,0 +1,86 @@
+// The worker that computes responses for a scene that is rendered in the browser. It keeps the newest pose of each emitter alone, finds all
+// direct paths first, and then computes one response at a time.
+
+import { Field } from "./field.js";
+import { spectraOf } from "./renderer.js";
+
+let field = null;
+let quantum = 0;
+const placed = new Map(); // emitter id -> {listener, emitter, poseId, hasPath}; in the order in which responses are computed
+const spare = []; // spectra to write into
+const { port1, port2 } = new MessageChannel();
+let isBusy = false;
+
+async function open({ server, scene, level, key, sampleRate, block }) {
+  try {
+    field = await Field.load(server, scene, { level, key });
+    if (field.sampleRate !== sampleRate) {
+      throw new Error(`the field of scene ${scene} has ${field.sampleRate} Hz: open the AudioContext with this rate, not with ${sampleRate}`);
+    }
+    quantum = block;
+    const longestS = field.longestM / field.speedOfSound;
+    self.postMessage({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS });
+  } catch ({ code = null, message, status }) {
+    self.postMessage({ type: "failed", code, message, needsKey: status === 401 });
+  }
+}
+
+/** Takes the newest poses of an emitter and of the listener. One that waits for a response keeps its turn. */
+function place({ id, ...pose }) {
+  placed.set(id, { ...pose, hasPath: false });
+  if (!isBusy) {
+    isBusy = true;
+    port2.postMessage(null);
+  }
+}
+
+function pathOf({ listener, emitter }) {
+  field.requireInside(listener, "listener");
+  field.requireInside(emitter, "emitter");
+  const path = field.directPath(listener, emitter);
+  const [x, y, z] = path.arrival;
+  return { delay: (path.lengthM / field.speedOfSound) * field.sampleRate, filter: field.directFilter(path), gains: [1, y, z, x] };
+}
+
+function refuse(id, error) {
+  placed.delete(id);
+  self.postMessage({ type: "refused", id, message: error.message });
+}
+
+port1.onmessage = () => {
+  for (const [id, pose] of placed) {
+    if (pose.hasPath) continue;
+    try {
+      self.postMessage({ type: "path", id, poseId: pose.poseId, path: pathOf(pose) });
+      pose.hasPath = true;
+    } catch (error) {
+      refuse(id, error);
+    }
+  }
+  const [next] = placed;
+  if (next) {
+    const [id, { listener, emitter, poseId }] = next;
+    placed.delete(id);
+    try {
+      const start = performance.now();
+      const channels = field.reflections(listener, emitter);
+      const ms = performance.now() - start;
+      const spectra = spectraOf(channels, quantum, spare.pop());
+      self.postMessage({ type: "response", id, poseId, spectra, ms }, [spectra.buffer]);
+    } catch (error) {
+      refuse(id, error);
+    }
+  }
+  // By a message to itself, so that poses that have arrived come first.
+  isBusy = placed.size > 0;
+  if (isBusy) port2.postMessage(null);
+};
+
+const commands = {
+  open,
+  place,
+  remove: ({ id }) => placed.delete(id),
+  spare: ({ spectra }) => spare.length < 4 && spare.push(spectra),
+};
+
+self.onmessage = ({ data: { type, ...detail } }) => commands[type](detail);

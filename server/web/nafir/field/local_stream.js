@@ -1,0 +1,260 @@
+// A stream that no server renders: what Stream is for a server's, with blocks that are computed here, from a field in a worker beside it. It
+// does no I/O but messages to that worker, and reads its clock from outside, so that tests can drive it.
+
+import { Convolver, DirectSound } from "./renderer.js";
+import { ClipSource, LiveSource } from "./sources.js";
+
+export const BLOCK = 256; // samples
+const CHANNELS = 4;
+const MOST_EMITTERS = 8;
+const BEHIND_S = 0.2; // of blocks that are late; more are left out
+const STATUS_MS = 1000;
+const REST_MS = 1000; // the pose of a listener at rest counts as new this often, so that the measured latency stays current
+const SHORTEST_S = 0.1; // of the delay line
+const MEASURED = 40; // responses
+
+const amplitudeOf = (gainDb = 0) => 10 ** (gainDb / 20);
+const samePlace = (one, other) => one.every((at, axis) => at === other[axis]);
+
+class LocalEmitter {
+  #shape;
+  #direct;
+  #convolver;
+  #input = new Float32Array(BLOCK);
+  #amplitude = null; // null before the first block
+  wanted = {}; // what the page wants of it
+  asked = -1; // newest pose for which the field was asked
+  hasPath = -1;
+  hasResponse = -1;
+  ending = null; // blocks that are left to ring; null while it plays
+
+  constructor(shape, source) {
+    this.#shape = shape;
+    this.source = source;
+    const { samples, taps, longestS, sampleRate } = shape;
+    this.#direct = new DirectSound({ quantum: BLOCK, sampleRate, taps, longestS: Math.max(SHORTEST_S, longestS) });
+    this.#convolver = new Convolver({ samples, quantum: BLOCK });
+  }
+
+  follow(path) {
+    this.#direct.follow(path);
+  }
+
+  exchange(spectra) {
+    return this.#convolver.exchange(spectra);
+  }
+
+  end() {
+    this.ending = Math.ceil((this.#shape.samples + this.#shape.longestS * this.#shape.sampleRate) / BLOCK) + 1;
+  }
+
+  /** Adds a block to the channels. Returns spectra that are no longer needed, or null. */
+  process(channels) {
+    const target = this.ending === null ? amplitudeOf(this.wanted.gainDb) : 0;
+    const before = this.#amplitude ?? target;
+    this.source.read(this.#input);
+    for (let i = 0; i < BLOCK; i++) this.#input[i] *= before + ((i + 1) / BLOCK) * (target - before);
+    this.#amplitude = target;
+    this.#direct.process(this.#input, channels);
+    return this.#convolver.process(this.#input, channels);
+  }
+}
+
+export class LocalStream {
+  #listeners;
+  #tell;
+  #now;
+  #sampleRate;
+  #shape = null; // of responses, once the field is there
+  #listener;
+  #wanted = new Map(); // id -> what the page wants of an emitter
+  #emitters = new Map(); // id -> LocalEmitter
+  #leaving = new Set();
+  #clips = new Map(); // name -> samples
+  #poseId = 0;
+  #posedAt = 0;
+  #startedAt = 0;
+  #rendered = 0; // blocks, since startedAt
+  #sequence = 0;
+  #late = 0;
+  #dropped = 0;
+  #toldAt = 0;
+  #costs = [];
+
+  /**
+   * `hello` has scene, level and sampleRate, `server` and `key` are for the field. `tell(message, transfer)` sends to field_worker.js, whose
+   * messages go to `receive`. `listeners` are those of Stream; `now` gives epoch milliseconds.
+   */
+  constructor({ server, key = null, hello, listener, emitters, listeners, tell, now }) {
+    this.#listeners = listeners;
+    this.#tell = tell;
+    this.#now = now;
+    this.#sampleRate = hello.sampleRate;
+    this.#listener = listener;
+    for (const emitter of emitters) this.#wanted.set(emitter.id, emitter);
+    listeners.state({ state: "connecting", attempt: 0 });
+    tell({ type: "open", server, key, scene: hello.scene, level: hello.level, sampleRate: hello.sampleRate, block: BLOCK });
+  }
+
+  /** Takes a message of field_worker.js. */
+  receive({ type, ...detail }) {
+    const handlers = { opened: (shape) => this.#opened(shape), failed: (reason) => this.#failed(reason) };
+    const emitter = this.#emitters.get(detail.id);
+    if (handlers[type]) handlers[type](detail);
+    else if (type === "response") this.#gotResponse(emitter, detail);
+    else if (type === "path" && emitter) {
+      emitter.follow(detail.path);
+      emitter.hasPath = detail.poseId;
+    } else if (type === "refused") {
+      if (emitter) emitter.hasPath = emitter.hasResponse = emitter.asked; // it stays where it was
+      this.#listeners.refused({ code: "position_out_of_bounds", message: detail.message, field: null, emitter: detail.id });
+    }
+  }
+
+  #opened({ level, ...shape }) {
+    this.#shape = { ...shape, sampleRate: this.#sampleRate };
+    const welcome = {
+      type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: BLOCK, channels: CHANNELS, encoding: "f32", level,
+      order: 1, max_emitters: MOST_EMITTERS,
+    };
+    this.#startedAt = this.#toldAt = this.#now();
+    this.#listeners.state({ state: "live", welcome });
+    this.setListener({ ...this.#listener, at: this.#now() });
+    for (const emitter of this.#wanted.values()) this.setEmitter(emitter);
+  }
+
+  #failed({ code, message, needsKey }) {
+    if (code !== null) this.#listeners.refused({ code, message, field: null });
+    this.#listeners.state({ state: "refused", reason: message, needsKey });
+  }
+
+  #gotResponse(emitter, { poseId, spectra, ms }) {
+    this.#costs.push(ms);
+    if (this.#costs.length > MEASURED) this.#costs.shift();
+    const unused = emitter ? emitter.exchange(spectra) : spectra;
+    this.#giveBack(unused);
+    if (emitter) emitter.hasResponse = poseId;
+  }
+
+  #giveBack(spectra) {
+    if (spectra) this.#tell({ type: "spare", spectra }, [spectra.buffer]);
+  }
+
+  #posed(at) {
+    this.#posedAt = at;
+    this.#listeners.posed({ poseId: this.#poseId, at });
+  }
+
+  setListener(listener) {
+    const moved = !samePlace(this.#listener.position, listener.position);
+    this.#listener = listener;
+    if (!this.#shape) return;
+    this.#posed(listener.at);
+    for (const [id, emitter] of this.#emitters) {
+      if (moved) this.#ask(id, emitter);
+    }
+    this.#poseId += 1;
+  }
+
+  #ask(id, emitter) {
+    emitter.asked = this.#poseId;
+    this.#tell({ type: "place", id, poseId: this.#poseId, listener: [...this.#listener.position], emitter: [...emitter.wanted.position] });
+  }
+
+  setEmitter(wanted) {
+    const { id, clip, loop, position } = wanted;
+    this.#wanted.set(id, wanted);
+    if (!this.#shape) return;
+    let emitter = this.#emitters.get(id);
+    if (emitter && emitter.wanted.clip !== clip) {
+      this.#leave(id);
+      emitter = undefined;
+    }
+    if (!emitter && this.#emitters.size >= MOST_EMITTERS) {
+      const message = `at most ${MOST_EMITTERS} emitters are rendered here`;
+      this.#listeners.refused({ code: "too_many_emitters", message, field: "id", emitter: id });
+      return;
+    }
+    const moved = !emitter || !samePlace(emitter.wanted.position, position);
+    if (!emitter) {
+      const source = clip === undefined ? new LiveSource(this.#sampleRate) : new ClipSource(this.#clips.get(clip) ?? null, loop);
+      emitter = new LocalEmitter(this.#shape, source);
+      this.#emitters.set(id, emitter);
+    }
+    emitter.wanted = wanted;
+    if (!moved) return;
+    this.#posed(wanted.at);
+    this.#ask(id, emitter);
+    this.#poseId += 1;
+  }
+
+  /** Takes the samples of a clip, at the rate of the stream. */
+  setSound({ name, samples }) {
+    this.#clips.set(name, samples);
+    for (const { wanted, source } of this.#emitters.values()) if (wanted.clip === name) source.samples = samples;
+  }
+
+  /** Takes the next mono samples of a live emitter. */
+  feed(id, samples) {
+    this.#emitters.get(id)?.source.feed?.(samples);
+  }
+
+  removeEmitter(id) {
+    this.#wanted.delete(id);
+    if (this.#emitters.has(id)) this.#leave(id);
+  }
+
+  #leave(id) {
+    const emitter = this.#emitters.get(id);
+    this.#emitters.delete(id);
+    this.#tell({ type: "remove", id });
+    emitter.end();
+    this.#leaving.add(emitter);
+  }
+
+  /** Renders the blocks that are due. Call it often. */
+  tick() {
+    if (!this.#shape) return;
+    const now = this.#now();
+    if (now - this.#posedAt >= REST_MS) this.setListener({ ...this.#listener, at: now });
+    const due = Math.floor((((now - this.#startedAt) / 1000) * this.#sampleRate) / BLOCK) + 1;
+    const most = Math.ceil((BEHIND_S * this.#sampleRate) / BLOCK);
+    if (due - this.#rendered > most) {
+      this.#dropped += due - this.#rendered - 1;
+      this.#rendered = due - 1;
+    }
+    for (; this.#rendered < due; this.#rendered++) {
+      const isLate = due - this.#rendered > 1;
+      this.#late += isLate ? 1 : 0;
+      this.#listeners.block(this.#render(isLate));
+    }
+    if (now - this.#toldAt >= STATUS_MS) {
+      this.#toldAt = now;
+      this.#listeners.status({ type: "status", blocks_late: this.#late, blocks_dropped: this.#dropped, ir_ms: { p50: this.#median } });
+    }
+  }
+
+  get #median() {
+    return this.#costs.length === 0 ? null : [...this.#costs].sort((a, b) => a - b)[this.#costs.length >> 1];
+  }
+
+  #render(late) {
+    const channels = Array.from({ length: CHANNELS }, () => new Float32Array(BLOCK));
+    const poses = { poseId: this.#heard("hasPath"), reverberationPoseId: this.#heard("hasResponse") };
+    for (const emitter of this.#emitters.values()) this.#giveBack(emitter.process(channels));
+    for (const emitter of this.#leaving) {
+      this.#giveBack(emitter.process(channels));
+      emitter.ending -= 1;
+      if (emitter.ending <= 0) this.#leaving.delete(emitter);
+    }
+    const sequence = this.#sequence++;
+    return { ...poses, channels, sequence, sampleClock: sequence * BLOCK, frames: BLOCK, flags: 0, late };
+  }
+
+  /** The newest pose with which everything is heard. */
+  #heard(has) {
+    let newest = Math.max(0, this.#poseId - 1);
+    for (const emitter of this.#emitters.values()) if (emitter[has] < emitter.asked) newest = Math.min(newest, Math.max(0, emitter[has]));
+    return newest;
+  }
+}

@@ -1,0 +1,56 @@
+// A LocalStream in a worker of its own, with the interface of WorkerStream: the scene is rendered in this browser. It fetches and decodes
+// the clips that emitters play, since only a page can decode.
+
+import { apiOf, fetchBytes } from "../http.js";
+import { WorkerStream } from "../worker_stream.js";
+
+export class LocalWorkerStream extends WorkerStream {
+  #server = null;
+  #key = null;
+  #sampleRate = 0;
+  #clips = new Set(); // asked for
+
+  constructor(worker = new Worker(new URL("./stream_worker.js", import.meta.url), { type: "module" })) {
+    super(worker);
+  }
+
+  /** Opens a stream, in place of any before. `url` is the address of a server, of which nothing is asked but files. */
+  open({ url, key, hello, listener, emitters, port }) {
+    this.#server = apiOf(url);
+    this.#key = key;
+    if (hello.sampleRate !== this.#sampleRate) this.#clips.clear();
+    this.#sampleRate = hello.sampleRate;
+    super.open({ server: this.#server.href, key, hello, listener, emitters, port });
+    for (const emitter of emitters) this.#fetch(emitter);
+  }
+
+  tell(type, detail, transfer = []) {
+    if (type === "emitter") this.#fetch(detail);
+    super.tell(type, detail, transfer);
+  }
+
+  async #fetch({ clip }) {
+    if (clip === undefined || this.#server === null || this.#clips.has(clip)) return;
+    this.#clips.add(clip);
+    const sampleRate = this.#sampleRate;
+    try {
+      const bytes = await fetchBytes(new URL(`clips/${encodeURIComponent(clip)}/audio`, this.#server), { key: this.#key });
+      const decoded = await new OfflineAudioContext(1, 1, sampleRate).decodeAudioData(bytes.buffer);
+      if (sampleRate === this.#sampleRate) super.tell("sound", { name: clip, samples: meanOf(decoded) });
+    } catch (error) {
+      this.#clips.delete(clip); // so that it is tried again
+      const detail = { code: error.code ?? "unplayable_clip", message: `${clip} cannot be played here: ${error.message}`, field: "clip" };
+      this.dispatchEvent(new CustomEvent("refused", { detail }));
+    }
+  }
+}
+
+/** The mean of an AudioBuffer's channels. */
+function meanOf(buffer) {
+  const mean = new Float32Array(buffer.length);
+  for (let channel = 0; channel < buffer.numberOfChannels; channel++) {
+    const samples = buffer.getChannelData(channel);
+    for (let i = 0; i < mean.length; i++) mean[i] += samples[i] / buffer.numberOfChannels;
+  }
+  return mean;
+}
