@@ -13,7 +13,7 @@ from rich.console import Console
 from server.core.command_line import figure_file, require_at_most_one, writable_file, writable_folder
 from server.core.files import require_matplotlib, require_writable
 from server.core.numerals import parse_decimal
-from training.cli.options import Cluster, Json, Seed, progress_bar
+from training.cli.options import Cluster, FirstSeed, Json, Seed, progress_bar
 
 if TYPE_CHECKING:
     from training.baselines.held_out import HeldOut
@@ -332,6 +332,7 @@ def fractions(
         str, typer.Option("--fractions", help="Percentages of the training pairs, separated by commas.")
     ] = "5,10,25,50,100",
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Runs of each field on each fraction.")] = 3,
+    first_seed: FirstSeed = 0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over all pairs; runs on fewer make as many steps.")] = 8,
     points: Annotated[int, typer.Option(min=1, help="Points of each response that a naf trains on per step.")] = 100,
     pairs: Annotated[int, typer.Option(min=1, help="Held-out pairs to score.")] = 40,
@@ -343,7 +344,7 @@ def fractions(
     from training.trials.fractions_figure import SHOWN, figure_of, spreads
 
     require_matplotlib("--output")
-    chosen = trials(names_of(fields), [percentage(text) for text in names_of(percents)], seeds)
+    chosen = trials(names_of(fields), [percentage(text) for text in names_of(percents)], seeds, first_seed)
     with progress_bar() as progress:
         found = measure_fractions(data, output, chosen, Effort(epochs, points, pairs), progress)
     figure_of(found).savefig(output / "fractions.png", dpi=110)

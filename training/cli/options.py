@@ -9,6 +9,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
+FirstSeed = Annotated[
+    int, typer.Option(min=0, help="First of the seeds: several processes may have some each, in folders of their own.")
+]
 
 Cluster = Annotated[
     str | None,

@@ -12,7 +12,7 @@ from rich.console import Console
 from server.core.command_line import writable_folder
 from server.core.errors import NafirError
 from server.core.numerals import parse_integer
-from training.cli.options import Json, Seed
+from training.cli.options import FirstSeed, Json, Seed
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)]
 
@@ -43,7 +43,8 @@ def cross_modal(
         str, typer.Option(help="Any of nerf, nerf-naf, nerf-grid and nerf-grid-l2, separated by commas.")
     ] = "nerf,nerf-naf",
     views: Annotated[str, typer.Option(help="Numbers of views to train on, separated by commas.")] = "75,100,150",
-    seeds: Annotated[int, typer.Option(min=1, max=100, help="Trainings of each, from seed 0 on.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Trainings of each, a seed after the other.")] = 3,
+    first_seed: FirstSeed = 0,
     small: Annotated[
         bool, typer.Option("--small", help="Start from sizes for two cores in place of the paper's.")
     ] = False,
@@ -89,7 +90,9 @@ def cross_modal(
     }
     recipe = replace(SMALL if small else Recipe(), **{name: each for name, each in given.items() if each is not None})
     chosen = [name.strip() for name in methods.split(",") if name.strip()]
-    result = compare(data, images, output, chosen, _numbers(views), seeds, recipe, _track())
+    result = compare(
+        data, images, output, chosen, _numbers(views), range(first_seed, first_seed + seeds), recipe, _track()
+    )
     if as_json:
         typer.echo(json.dumps(result, indent=2))
         return

@@ -44,6 +44,9 @@ class BasisLearner(ABC):
         self._spreads, self._weights, self._decode = spreads, weights, decode
         self._targets: Targets | None = None
 
+    def to(self, device: torch.device) -> None:
+        self.field.to(device)
+
     @property
     def prepared_s(self) -> float:
         return self.targets.seconds

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from rich.progress import Progress
 from torch import Tensor, nn
 
@@ -23,6 +24,10 @@ class Learner(Protocol):
 
     def prepare(self, progress: Progress) -> None:
         """Compute targets, or load them. Results that take long are stored beside the responses."""
+        ...
+
+    def to(self, device: torch.device) -> None:
+        """Move the field to the device, and what batches are made of if it has room; after `prepare`."""
         ...
 
     @property

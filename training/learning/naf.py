@@ -11,6 +11,7 @@ from torch import Tensor
 
 from training.data.responses import ResponseSet
 from training.learning.basis import TARGETS
+from training.learning.held import HeldTargets
 from training.learning.learner import Losses, Rows
 from training.learning.runs import Configuration, NafRecipe, RecipeError
 from training.learning.schedule import decay_to_a_tenth
@@ -31,7 +32,7 @@ _ENVELOPE_SAMPLES = 65
 
 class NafLearner:
     """Computes targets as they are needed, from responses that are drawn once, or measured. That takes milliseconds; a
-    step takes seconds."""
+    step takes seconds. A step of a GPU takes milliseconds, too, so it computes them itself of what it holds."""
 
     def __init__(self, responses: ResponseSet, configuration: Configuration) -> None:
         shape, recipe = configuration.shape, configuration.recipe
@@ -50,6 +51,7 @@ class NafLearner:
         self._trainable = np.flatnonzero(~responses.held_out)
         self._drawn: Targets | None = None
         self._expected: Targets | None = None
+        self._held: HeldTargets | None = None
 
     def prepare(self, progress: Progress) -> None:
         """Draw the responses of a simulation, or compute what is expected of them; measured ones are read as they are
@@ -59,6 +61,22 @@ class NafLearner:
             self._expected = load_expected_points(self.responses, self.codec, folder, progress)
         elif isinstance(self.responses, SimulatedResponses):
             self._drawn = load_aligned(self.responses, self.responses.file.parent / TARGETS, progress)
+
+    def to(self, device: torch.device) -> None:
+        self.field.to(device)
+        targets = self._expected or self._drawn
+        if targets is not None and HeldTargets.fit(targets.flat, device):
+            self.hold(device)
+
+    def hold(self, device: torch.device) -> None:
+        """Keep the targets on the device, for batches that are made there; after `prepare`."""
+        targets = self._expected or self._drawn
+        if targets is None:
+            raise RuntimeError("measured responses are read as they are needed")
+        field, encoded = self.field, self._expected is not None
+        self._held = HeldTargets(
+            targets.flat, self.codec, field.channels, field.axes, field.shape.outputs, encoded=encoded, device=device
+        )
 
     @property
     def prepared_s(self) -> float:
@@ -122,22 +140,24 @@ class NafLearner:
         validating = rng is None
         rng = np.random.default_rng(0) if rng is None else rng
         field, recipe, chosen = self.field, self.recipe, self._trainable[rows]
-        indices = np.empty((len(field.axes), len(rows), recipe.points), dtype=np.int64)
-        values = np.empty((len(rows), field.channels, recipe.points, field.shape.outputs), dtype=np.float32)
+        drawn = np.empty((len(field.axes), len(rows), recipe.points), dtype=np.int64)
         for number, row in enumerate(chosen):
             *across, frames = field.axes
             padded = validating or rng.random() < recipe.padding
             reach = frames if padded else min(frames, self._recorded_length(row))
-            points = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
-            indices[:, number] = points
-            of_ears: Any = self._values_of(row)
-            values[number] = of_ears[:, *points]
+            drawn[:, number] = [rng.integers(0, size, recipe.points) for size in (*across, reach)]
+        indices = torch.from_numpy(drawn)
         poses = [part[chosen] for part in (self.responses.listener, self.responses.emitter, self.responses.yaw)]
         if not validating:
             for position in poses[:2]:
                 position += rng.normal(0, recipe.noise_m, position.shape)
-        inputs = *(torch.from_numpy(pose.astype(np.float32)) for pose in poses), *map(torch.from_numpy, indices)
-        return inputs, (torch.from_numpy(values), torch.from_numpy(indices))
+        if self._held is None:
+            values = self._values_at(chosen, drawn)
+        else:
+            indices = indices.to(self._held.device)
+            values = self._held.at(rows, indices)
+        inputs = *(torch.from_numpy(pose.astype(np.float32)) for pose in poses), *indices
+        return inputs, (values, indices)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
         values, indices = targets
@@ -157,6 +177,15 @@ class NafLearner:
             return align(self.responses.read([row])[0], delay_samples(self.responses, row))
         flat = self._drawn.flat[np.searchsorted(self._trainable, row)]
         return np.asarray(flat.reshape(self.responses.channels, -1), np.float64)
+
+    def _values_at(self, chosen: Rows, indices: npt.NDArray[np.int64]) -> Tensor:
+        """(B, ear, N, outputs) values of responses (B,) at points (axis, B, N)."""
+        field = self.field
+        values = np.empty((len(chosen), field.channels, indices.shape[-1], field.shape.outputs), dtype=np.float32)
+        for number, row in enumerate(chosen):
+            of_ears: Any = self._values_of(row)
+            values[number] = of_ears[:, *indices[:, number]]
+        return torch.from_numpy(values)
 
     def _values_of(self, row: int) -> npt.NDArray[np.floating]:
         """Return the values that the network learns of a row: (ear, *axes, outputs)."""

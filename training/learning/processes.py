@@ -15,6 +15,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from training.learning.precision import compiled
+
 
 @dataclass(frozen=True)
 class Processes:
@@ -61,7 +63,8 @@ class Processes:
         return self.rank == 0
 
     def parallel(self, field: nn.Module) -> nn.Module:
-        """The field, with gradients averaged over all processes."""
+        """The field, with gradients averaged over all processes, and compiled for a GPU."""
+        field = compiled(field, self.device)
         if self.count == 1:
             return field
         ids = [self.device.index] if self.device.type == "cuda" else None

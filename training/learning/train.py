@@ -88,7 +88,7 @@ def train(
         processes.wait()
         if not processes.first:
             learner.prepare(progress)
-        learner.field.to(processes.device)
+        learner.to(processes.device)
         loop = _Loop(
             learner, run, configuration, processes, split(responses, share=configuration.share, seed=configuration.seed)
         )

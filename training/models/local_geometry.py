@@ -57,6 +57,22 @@ class GaussianGrid(nn.Module):
         # guard: kernel weights of the paper's grid are a softmax
         return torch.softmax(-squared / (2 * self.bandwidths_m**2), dim=-1) @ self.features
 
+    def of_many(self, position: Tensor) -> Tensor:
+        """The same for many points, by a product of matrices in place of a difference for each point and cell: memory
+        is passed over less often. Exponents err by some 1e-4 within a flat."""
+        # Squares of metres over those of decimetres: bfloat16 would not tell one cell from the next.
+        with torch.autocast(position.device.type, enabled=False):
+            middle = self._cells.mean(dim=0)
+            cells = self._cells + _FLOAT_M * torch.tanh(self.offset) - middle
+            at = position[:, :2].float() - middle
+            sharpness = 1 / (2 * self.bandwidths_m**2)
+            points = torch.cat([at, at.square().sum(dim=-1, keepdim=True), torch.ones_like(at[:, :1])], dim=-1)
+            weights = torch.stack(
+                [2 * cells[:, 0], 2 * cells[:, 1], -torch.ones_like(sharpness), -cells.square().sum(-1)]
+            )
+            shares = torch.softmax(points @ (sharpness * weights), dim=-1)
+        return shares @ self.features
+
 
 class OrientationEmbedding(nn.Module):
     """A learned vector per layer for each measured head orientation, interpolated between the two nearest. At measured

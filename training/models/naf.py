@@ -119,23 +119,24 @@ class Naf(nn.Module):
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, *indices: Tensor) -> Tensor:
         """`indices` (B, N) along each axis."""
         features = self.pose_features(listener, emitter)
-        starts = []
-        for layer in self.entries:
-            start = self.of_pose(layer, features)[:, None]
-            for table, index in zip(self.tables(layer), indices, strict=True):
-                start = start + table[index]
-            starts.append(start)
-        first, skipped = starts
+        # Not by rows of `tables`: their gradient would be a scattered sum, which is slower than this product.
+        points = torch.cat([self.encoding(axis)[index] for axis, index in enumerate(indices)], dim=-1)
+        first, skipped = (
+            self.of_pose(layer, features)[:, None] + nn.functional.linear(points, layer.weight[:, -points.shape[-1] :])
+            for layer in self.entries
+        )
         values: Tensor = self.last(self.trunk(first, skipped, self.orientations(yaw), self.inner))
         return values
 
     def trunk(self, first: Tensor, skipped: Tensor, orientation: Tensor, inner: nn.ModuleList) -> Tensor:
         """From the outputs (B, N, width) of both input layers, through the layers `inner` (all inner layers, or the
         first of them), to (B, ear, N, width). `orientation` is (B, layers, width)."""
+        # Embeddings take the precision of layers, which is lower under autocast: or else sums of both would be wide.
         past = self.skip[1](nn.functional.leaky_relu(skipped, SLOPE))
-        hidden = first[:, None] + self.embedding(orientation, 0)
+        hidden = first[:, None] + self.embedding(orientation, 0).to(first.dtype)
         for number, layer in enumerate(inner):
-            hidden = layer(nn.functional.leaky_relu(hidden, SLOPE)) + self.embedding(orientation, number + 1)
+            hidden = layer(nn.functional.leaky_relu(hidden, SLOPE))
+            hidden = hidden + self.embedding(orientation, number + 1).to(hidden.dtype)
             if number == len(self.inner) // 2 - 1:
                 hidden = hidden + past[:, None]
         return hidden

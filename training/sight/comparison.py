@@ -29,7 +29,7 @@ def compare(
     run: Path,
     methods: Sequence[str],
     counts: Sequence[int],
-    seeds: int,
+    seeds: Sequence[int],
     recipe: Recipe,
     track: _Track,
 ) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def compare(
     torch.set_num_threads(1 if not torch.cuda.is_available() else threads)
     try:
         for count in counts:
-            for seed in range(seeds):
+            for seed in seeds:
                 for method in chosen:
                     folder = run / str(count) / f"{method}-{seed}"
                     training = Training(folder, dataset, views, method, count, seed, recipe)
@@ -64,7 +64,7 @@ def compare(
                     write_json(run / RESULTS, result)
     finally:
         torch.set_num_threads(threads)
-    side_by_side(run, views, counts[0], chosen).save(run / PICTURES)
+    side_by_side(run, views, counts[0], chosen, seeds[0]).save(run / PICTURES)
     return result
 
 
@@ -85,6 +85,8 @@ def _tested(folder: Path, training: Training, views: Views, track: _Track) -> di
         "psnr_of_views_db": [round(psnr_db(*pair), 3) for pair in pairs],
         "naf_validation_loss": training.validation_loss(),
         "cpu_s": training.cpu_s,
+        "device": training.device,
+        "device_s": training.device_s,
     }
     write_json(path, tested)
     return tested
@@ -97,7 +99,7 @@ def _result(views: Views, recipe: Recipe, rows: list[dict[str, Any]]) -> dict[st
         "scene": views.scene,
         "pixels": [width, height],
         "test_views": len(views.test),
-        "device": "cuda" if torch.cuda.is_available() else "cpu",
+        "device": ", ".join(dict.fromkeys(row["device"] for row in rows)),
         "recipe": dict(vars(recipe)),
         "one_colour_psnr_db": mean(psnr_db(np.broadcast_to(flat, true.shape), true) for true in views.test_pictures),
         "rows": rows,
@@ -140,11 +142,11 @@ def table(result: dict[str, Any]) -> list[list[str]]:
     return lines
 
 
-def side_by_side(run: Path, views: Views, count: int, methods: Sequence[str]) -> Image.Image:
-    """The first test views: the truth on the left, then each method, of seed 0."""
+def side_by_side(run: Path, views: Views, count: int, methods: Sequence[str], seed: int) -> Image.Image:
+    """The first test views: the truth on the left, then each method, of one seed."""
     columns = [views.test_pictures[:SHOWN]]
     for method in methods:
-        folder = run / str(count) / f"{method}-0"
+        folder = run / str(count) / f"{method}-{seed}"
         shown: list[npt.NDArray[np.uint8]] = []
         for number in range(len(columns[0])):
             with Image.open(folder / f"test-{number:03d}.png") as image:

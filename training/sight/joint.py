@@ -21,7 +21,7 @@ from training.data.dataset import Dataset
 from training.learning.learner import Rows
 from training.learning.naf import NafLearner
 from training.learning.pairs import split
-from training.learning.precision import autocast
+from training.learning.precision import autocast, compiled
 from training.learning.runs import (
     CHECKPOINT,
     Configuration,
@@ -171,20 +171,23 @@ class Training:
         elif self.grid is not None:
             self._parts["grid"] = self.grid
         self._parts.to(self._device)
+        self.nerf.quicken(self._device, self.grid)
+        self._quick_field = None if self.learner is None else compiled(self.learner.field, self._device)
         shots = zip(pictures.training[:views], pictures.training_pictures[:views], strict=True)
         rays, colours = [], []
         for camera, picture in shots:
             rays.append(Rays.within(*camera.rays(), pictures.low, pictures.high))
             colours.append(torch.tensor(picture.reshape(-1, 3), dtype=torch.float32) / 255)
-        self._rays = Rays(*(torch.cat(part) for part in zip(*(vars(each).values() for each in rays), strict=True)))
-        self._colours = torch.cat(colours)
+        joined = Rays(*(torch.cat(part) for part in zip(*(vars(each).values() for each in rays), strict=True)))
+        self._rays, self._colours = joined.to(self._device), torch.cat(colours).to(self._device)
         groups = [{"params": list(self.nerf.parameters()), "weight_decay": 0.0}]
         if self.learner is not None:
             groups += self.learner.parameter_groups()
         elif self.grid is not None:
             groups.append({"params": list(self.grid.parameters()), "weight_decay": 0.0})
-        self._optimiser = torch.optim.AdamW(groups, recipe.learning_rate)
-        self.step, self.cpu_s = 0, 0.0
+        self._optimiser = torch.optim.AdamW(groups, recipe.learning_rate, fused=self._device.type == "cuda")
+        self._epoch, self._order = -1, np.empty(0, np.int64)
+        self.step, self.cpu_s, self.device_s = 0, 0.0, 0.0
 
     def _claim(self, configuration: dict[str, Any]) -> None:
         """Make the folder a run of this configuration. Raises RunError if it holds another."""
@@ -200,6 +203,7 @@ class Training:
             self._parts.load_state_dict(state["parts"])
             self._optimiser.load_state_dict(state["optimiser"])
             self.step, self.cpu_s = int(state["step"]), float(state["cpu_s"])
+            self.device_s = float(state["device_s"])
         steps = self._recipe.steps
         if self.step == steps:
             return
@@ -207,11 +211,12 @@ class Training:
         if self.learner is not None:
             if self._recipe.share == 1.0:
                 self.learner.prepare(Progress(disable=True))
+                self.learner.to(self._device)
             if not self.step:
                 self.learner.initialise(self._rows, self._seed)
-        sums: dict[str, float] = {}
-        saved_s, began_s = time.monotonic(), time.process_time()
-        before_s = self.cpu_s
+        sums: dict[str, Tensor] = {}
+        saved_s, began_s, clock_s = time.monotonic(), time.process_time(), time.monotonic()
+        before_s, before_clock_s = self.cpu_s, self.device_s
         for number in track(
             range(self.step, steps), f"{self._run.parent.name} views, {self._method}, seed {self._seed}"
         ):
@@ -219,10 +224,13 @@ class Training:
             self._descend(number, losses)
             self.step = number + 1
             for name, loss in losses.items():
-                sums[name] = sums.get(name, 0.0) + float(loss.detach()) / _LOG_STEPS
+                sums[name] = sums.get(name, 0) + loss.detach().double() / _LOG_STEPS
             self.cpu_s = before_s + time.process_time() - began_s
+            if self._device.type == "cuda":
+                self.device_s = before_clock_s + time.monotonic() - clock_s
             if self.step % _LOG_STEPS == 0:
-                append_log(self._run, {"step": self.step, "cpu_s": self.cpu_s, **sums})
+                means = {name: float(total) for name, total in sums.items()}
+                append_log(self._run, {"step": self.step, "cpu_s": self.cpu_s, **means})
                 sums = {}
                 # A checkpoint between two lines of the log would forget a part of the second one.
                 if time.monotonic() - saved_s > _CHECKPOINT_S:
@@ -234,51 +242,61 @@ class Training:
         """The terms of the loss in a step; they depend on the step's number, the seed and the parameters alone."""
         recipe, device = self._recipe, self._device
         rng = np.random.default_rng([self._seed, 21, step])
-        some = torch.from_numpy(rng.integers(0, len(self._colours), recipe.rays))
-        generator = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
-        true = self._colours[some].to(device)
+        some = torch.from_numpy(rng.integers(0, len(self._colours), recipe.rays)).to(device)
+        generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+        true = self._colours[some]
         with autocast(device, bfloat16=device.type == "cuda"):
-            coarse, fine = self.nerf(self._rays[some].to(device), self.grid, generator)
+            coarse, fine = self.nerf(self._rays[some], self.grid, generator)
         losses = {"colour": (fine - true).square().mean(), "coarse": (coarse - true).square().mean()}
-        if self.learner is not None:
+        if self.learner is not None and self._quick_field is not None:
             inputs, targets = self.learner.batch(self._rows_of(step), np.random.default_rng([self._seed, 22, step]))
-            losses["naf"] = recipe.naf_weight * self._naf_loss(inputs, targets)
+            losses["naf"] = recipe.naf_weight * self._naf_loss(self._quick_field, inputs, targets)
         if self._method == "nerf-grid-l2" and self.grid is not None:
             losses["l2"] = recipe.l2 * self.grid.features.square().sum()
         return losses
 
-    def _naf_loss(self, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]) -> Tensor:
+    def _naf_loss(self, field: nn.Module, inputs: tuple[Tensor, ...], targets: tuple[Tensor, ...]) -> Tensor:
         assert self.learner is not None
         on_device = [tuple(part.to(self._device) for part in parts) for parts in (inputs, targets)]
         with autocast(self._device, bfloat16=self._device.type == "cuda"):
-            prediction = self.learner.field(*on_device[0])
+            prediction = field(*on_device[0])
         return torch.stack(list(self.learner.losses(prediction.float(), on_device[1]).values())).sum()
 
     def _rows_of(self, step: int) -> Rows:
         """The rows of a step: each pair once an epoch, as the field of sound is trained alone."""
         assert self.learner is not None
-        order = self.learner.epoch(self._rows, np.random.default_rng([self._seed, 5, 0]))
-        size = min(self._recipe.responses, len(order))
-        epoch, number = divmod(step, max(1, len(order) // size))
-        if epoch:
-            order = self.learner.epoch(self._rows, np.random.default_rng([self._seed, 5, epoch]))
-        return order[number * size : (number + 1) * size]
+        visited = len(self._order) or len(self._order_of(0))
+        size = min(self._recipe.responses, visited)
+        epoch, number = divmod(step, max(1, visited // size))
+        if epoch != self._epoch:
+            self._epoch, self._order = epoch, self._order_of(epoch)
+        return self._order[number * size : (number + 1) * size]
+
+    def _order_of(self, epoch: int) -> Rows:
+        assert self.learner is not None
+        return self.learner.epoch(self._rows, np.random.default_rng([self._seed, 5, epoch]))
 
     def _descend(self, step: int, losses: dict[str, Tensor]) -> None:
         total = torch.stack(list(losses.values())).sum()
+        # A GPU is asked for the loss when it has all of the step to do.
+        self._optimiser.zero_grad(set_to_none=True)
+        total.backward()
         if not torch.isfinite(total):
             value = float(total.detach())
             raise NafirError(f"{self._run}: the loss is {value:g} in step {step + 1}; lower --learning-rate")
         beta, share = decay_to_a_tenth(step / self._recipe.steps)
         for group in self._optimiser.param_groups:
             group["lr"], group["betas"] = self._recipe.learning_rate * share, (beta, 0.999)
-        self._optimiser.zero_grad(set_to_none=True)
-        total.backward()
         self._optimiser.step()
 
     def _save(self) -> None:
-        parts, optimiser = self._parts.state_dict(), self._optimiser.state_dict()
-        save_checkpoint(self._run, {"parts": parts, "optimiser": optimiser, "step": self.step, "cpu_s": self.cpu_s})
+        state = {"parts": self._parts.state_dict(), "optimiser": self._optimiser.state_dict()}
+        save_checkpoint(self._run, state | {"step": self.step, "cpu_s": self.cpu_s, "device_s": self.device_s})
+
+    @property
+    def device(self) -> str:
+        """What the steps are computed on: the GPU's name, or the kind of the processor."""
+        return torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else self._device.type
 
     @torch.no_grad()
     def test_pictures(self) -> _Pixels:
@@ -298,4 +316,4 @@ class Training:
         """The loss of the field of sound at pairs that it was not trained on; None without one."""
         if self.learner is None:
             return None
-        return float(self._naf_loss(*self.learner.batch(self._validation, None)))
+        return float(self._naf_loss(self.learner.field, *self.learner.batch(self._validation, None)))

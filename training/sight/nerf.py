@@ -5,12 +5,19 @@ One thing differs: densities are a softplus of the network's output in place of 
 start of a short training. Axes: R rays, S samples of a ray; metres.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+
+from training.learning.precision import compiled
+from training.models.local_geometry import GaussianGrid
+
+_Network = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
+_Features = Callable[[Tensor], Tensor]
 
 _POSITION_OCTAVES, _DIRECTION_OCTAVES = 10, 4
 NEAREST_M = 0.05
@@ -129,29 +136,43 @@ class Nerf(nn.Module):
         self.register_buffer("_half", torch.tensor(float(np.max(high - low) / 2)), persistent=False)
         self._samples, self._more = coarse, fine
         self.coarse, self.fine = (Radiance(width, layers, features) for _ in range(2))
+        self._quick: tuple[_Network, _Network, _Features | None] | None = None
 
-    def forward(self, rays: Rays, grid: nn.Module | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """(R, 3) colours by both networks. Without a generator the samples are in the middle of their segments."""
+    def quicken(self, device: torch.device, grid: GaussianGrid | None) -> None:
+        """Compile what training steps do at each sample, if the device is a GPU."""
+        features = None if grid is None else compiled(grid.of_many, device)
+        self._quick = compiled(self.coarse, device), compiled(self.fine, device), features
+
+    def forward(
+        self, rays: Rays, grid: GaussianGrid | None, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """(R, 3) colours by both networks. Samples are drawn by a generator of the rays' device; without one they are
+        in the middle of their segments."""
         count, device = len(rays.origins), rays.origins.device
+        # Other numbers of rays than those of a step would be compiled anew.
+        slow = self.coarse, self.fine, None if grid is None else grid.of_many
+        coarse_network, fine_network, features = slow if generator is None else self._quick or slow
 
         def spread(samples: int) -> Tensor:
-            places = torch.full((count, samples), 0.5)
+            places = torch.full((count, samples), 0.5, device=device)
             if generator is not None:
-                places = torch.rand(count, samples, generator=generator)
-            return ((torch.arange(samples) + places) / samples).to(device)
+                places = torch.rand(count, samples, generator=generator, device=device)
+            return (torch.arange(samples, device=device) + places) / samples
 
         depths = NEAREST_M + spread(self._samples) * (rays.far_m[:, None] - NEAREST_M)
-        coarse, weights = self._march(self.coarse, rays, depths, grid)
+        coarse, weights = self._march(coarse_network, rays, depths, features)
         edges = torch.linspace(0, 1, self._samples + 1, device=device) * (rays.far_m[:, None] - NEAREST_M) + NEAREST_M
         more = draw_depths(edges, weights.detach(), spread(self._more))
         both, _ = torch.sort(torch.cat([depths, more], dim=1), dim=1)
-        fine, _ = self._march(self.fine, rays, both, grid)
+        fine, _ = self._march(fine_network, rays, both, features)
         return coarse, fine
 
-    def _march(self, network: Radiance, rays: Rays, depths: Tensor, grid: nn.Module | None) -> tuple[Tensor, Tensor]:
+    def _march(
+        self, network: _Network, rays: Rays, depths: Tensor, features_of: _Features | None
+    ) -> tuple[Tensor, Tensor]:
         points = (rays.origins[:, None] + depths[..., None] * rays.directions[:, None]).flatten(0, 1)
         directions = rays.directions[:, None].expand(*depths.shape, 3).flatten(0, 1)
-        features = None if grid is None else grid(points)
+        features = None if features_of is None else features_of(points)
         density, colour = network((points - self._middle) / self._half, directions, features)
         # The last segment has no end: what reaches it ends there, at the walls of the scene's box.
         spacing = torch.cat([depths[:, 1:] - depths[:, :-1], torch.full_like(depths[:, :1], 1e3)], dim=1)

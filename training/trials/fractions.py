@@ -95,14 +95,19 @@ class Fractions:
         return cls(values["data"], effort, values["floor"], tuple(map(Scored.from_json, values["scored"])))
 
 
-def trials(fields: Iterable[str], percents: Iterable[float], seeds: int) -> list[Trial]:
+def trials(fields: Iterable[str], percents: Iterable[float], seeds: int, first_seed: int = 0) -> list[Trial]:
     """All combinations, seed by seed, so that an interrupted comparison has whole curves. Raises FractionsError for a
     fraction that is none."""
     fields, percents = list(fields), list(percents)
     for percent in percents:
         if not 0 < percent <= 100:
             raise FractionsError(f"--fractions: {percent:g} is not a percentage above 0, up to 100")
-    return [Trial(field, percent, seed) for seed in range(seeds) for percent in percents for field in fields]
+    return [
+        Trial(field, percent, seed)
+        for seed in range(first_seed, first_seed + seeds)
+        for percent in percents
+        for field in fields
+    ]
 
 
 def configuration_of(trial: Trial, effort: Effort) -> Configuration:

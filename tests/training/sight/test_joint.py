@@ -168,7 +168,7 @@ def test_a_comparison_has_a_row_for_each_training_and_is_not_trained_twice(datas
     recipe = Recipe(**{**vars(RECIPE), "steps": 3})
 
     def run(track):
-        return compare(dataset.folder, images, tmp_path, ["nerf-naf", "nerf"], [2, 4], 2, recipe, track)
+        return compare(dataset.folder, images, tmp_path, ["nerf-naf", "nerf"], [2, 4], range(2), recipe, track)
 
     result = run(untracked)
     assert [(row["views"], row["seed"], row["method"]) for row in result["rows"]] == [

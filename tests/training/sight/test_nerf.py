@@ -84,12 +84,13 @@ def test_samples_are_in_order_and_within_their_ray() -> None:
     nerf = Nerf(low, high, width=8, layers=2, coarse=8, fine=16, features=2)
     places = []
 
-    def grid(points):
-        places.append(points)
-        return torch.zeros(len(points), 2)
+    class Grid:
+        def of_many(self, points):
+            places.append(points)
+            return torch.zeros(len(points), 2)
 
     rays = Rays.within(np.full((5, 3), 0.5), np.eye(3)[[0, 1, 2, 0, 1]], low, high)
-    nerf(rays, grid, torch.Generator().manual_seed(1))
+    nerf(rays, Grid(), torch.Generator().manual_seed(1))
     coarse, fine = places
     assert (len(coarse), len(fine)) == (5 * 8, 5 * 24)
     depths = torch.linalg.vector_norm(fine.view(5, 24, 3) - 0.5, dim=-1)

@@ -52,6 +52,7 @@ def test_curves_are_whole_seed_by_seed():
     chosen = trials(["naf", "directional"], [5, 100], seeds=2)
     assert len(chosen) == 8
     assert {trial.seed for trial in chosen[:4]} == {0}
+    assert trials(["naf", "directional"], [5, 100], seeds=1, first_seed=1) == chosen[4:]
     with pytest.raises(FractionsError, match="120 is not"):
         trials(["naf"], [120], seeds=1)
 
