@@ -1,5 +1,7 @@
 """Records what `nafir-train cross-modal` wrote to a run folder as a result, beside the paper's figures:
-`python -m benchmarks.cross_modal RUN COMMAND [COMMIT]`."""
+`python -m benchmarks.cross_modal RUN COMMAND [COMMIT [HOST]]`.
+
+HOST is a JSON file with the fields of `benchmarks.record.Host`, if another machine than this one measured."""
 
 import base64
 import json
@@ -112,14 +114,18 @@ def _rounded(value: float, digits: int) -> Value:
 
 
 def main() -> None:
-    run, command, *commit = sys.argv[1:]
+    run, command, *others = sys.argv[1:]
+    commit = others[:1]
     measured = json.loads((Path(run) / "results.json").read_text(encoding="utf-8"))
-    machine = describe_machine()
-    host = Host(
-        processor=str(machine["processor"]),
-        instruction_set=str(machine["instruction_set"]),
-        cores=machine["cores"] or UNKNOWN,
-    )
+    if len(others) > 1:
+        host = Host.model_validate_json(Path(others[1]).read_text(encoding="utf-8"))
+    else:
+        machine = describe_machine()
+        host = Host(
+            processor=str(machine["processor"]),
+            instruction_set=str(machine["instruction_set"]),
+            cores=machine["cores"] or UNKNOWN,
+        )
     png = (Path(run) / "views.png").read_bytes()
     result = result_of(measured, png, host=host, command=command, commit=commit[0] if commit else current_commit())
     (FOLDER / "cross-modal.json").write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")

@@ -130,6 +130,27 @@ def fractions(result: Result) -> Figure:
     return figure_of_fractions(Fractions.from_json(plain))
 
 
+def held_back_losses(result: Result) -> Figure:
+    """Draw the held-back loss of networks over their steps, and that of the training set's mean, a panel a scene."""
+    networks = json.loads(json.dumps(result.values["networks"], default=float))
+    figure = Figure(figsize=(6.6 * len(networks), 3.6), layout="constrained", facecolor="white")
+    for axes, (scene, of_scene) in zip(np.atleast_1d(figure.subplots(1, len(networks))), networks.items(), strict=True):
+        for name, record in of_scene.items():
+            steps, losses = np.array(record["curve"]).T
+            axes.plot(steps, losses, marker=".", label=name)
+        mean_loss = np.mean([record["mean_loss"] for record in of_scene.values()])
+        axes.axhline(mean_loss, color="#8a8a8a", linestyle="--", label="the training set's mean")
+        least = min(loss for record in of_scene.values() for _, loss in record["curve"])
+        # The first steps are far above the mean, where nothing is learned of places.
+        axes.set_ylim(least - 0.2 * (mean_loss - least), mean_loss + (mean_loss - least))
+        later = [step for record in of_scene.values() for step, loss in record["curve"] if loss < 2 * mean_loss - least]
+        axes.set_xlim(left=0.8 * min(later, default=1))
+        axes.set(xscale="log", xlabel="steps", ylabel="loss on held-back pairs", title=scene)
+        axes.legend(frameon=False, fontsize=9)
+        _bare(axes)
+    return figure
+
+
 def pictures_side_by_side(result: Result) -> Figure:
     """Show the true pictures and those of each method, a column each."""
     titles, stored = result.values["columns"], result.values["png"]
@@ -187,6 +208,7 @@ def _bare(axes: Axes) -> None:
 
 
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
-    each.__name__: each for each in (plan_of_effects, error_over_time, times_floor, fractions, pictures_side_by_side)
+    each.__name__: each
+    for each in (plan_of_effects, error_over_time, times_floor, fractions, held_back_losses, pictures_side_by_side)
 }
 """Functions that draw a plot, by the name used in results."""
