@@ -1,4 +1,5 @@
-// Drives client_examples/unity/Nafir for test_unity.py: a command a line on standard input, an answer a line on standard output.
+// Drives client_examples/unity/Nafir for test_unity.py: a command a line on standard input or one as arguments, an answer a line
+// on standard output.
 
 using System;
 using System.Collections;
@@ -15,10 +16,11 @@ using UnityEngine;
 
 static class UnityDriver
 {
-    static void Main()
+    static void Main(string[] given)
     {
         CultureInfo.DefaultThreadCurrentCulture = CultureInfo.CurrentCulture = new CultureInfo("de-DE"); // which writes 1,5
-        for (string line; (line = Console.ReadLine()) != null;)
+        if (given.Length > 0) Console.WriteLine(Answer(given[0], string.Join(" ", given.Skip(1))));
+        for (string line; given.Length == 0 && (line = Console.ReadLine()) != null;)
         {
             var words = line.Split(new[] { ' ' }, 2);
             var rest = words.Length > 1 ? words[1] : "";

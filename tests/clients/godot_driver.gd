@@ -41,7 +41,7 @@ func _initialize():
 	var vectors = JSON.parse(file.get_as_text()).result
 	var is_right = (
 		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
-		and _blocks(core, vectors.audio_blocks) and _texts(core) and _playing(core, 24036) and _playing(core, 23964)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
 	)
 	print("checked %d" % _checked)
 	quit(0 if is_right else 1)
@@ -124,6 +124,26 @@ func _texts(core):
 	for each in stream.texts:
 		print(to_json(each))
 	return _equal("a pose was sent", stream.packets.size(), 1)
+
+
+# A microphone's frames at 44.1 kHz become samples at 24 kHz, two frames later.
+func _resampling(core):
+	var stream = core.new()
+	stream.begin()
+	stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard"})
+	stream.set_emitter("voice", null, core.make_pose(Vector3(), Quat(0, 0, 0, 1)), 0.0)
+	stream.receive({"type": "emitter_added", "id": "voice", "sample_clock": 0.0})
+	for chunk in range(10):
+		var frames = []
+		for index in range(441):
+			var sample = sin(0.05 * (441 * chunk + index))
+			frames.append(Vector2(sample, sample))
+		stream.push_dry_frames("voice", frames, 44100.0)
+	var found = stream._emitters["voice"].dry
+	for index in range(10, found.size()):
+		if abs(found[index] - sin(0.05 * (index * 44100.0 / 24000.0 - 2.0))) > 1e-4:
+			return _fail("a resampled sample", index)
+	return _equal("samples", abs(found.size() - 2400) <= 1, true)
 
 
 # A server's clock of `rate` samples a second against a player's of 24000, for eight seconds: no gaps, and the pace follows.

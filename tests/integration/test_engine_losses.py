@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.clients.test_godot import GODOT, QUIET, needs_godot
 from tests.clients.test_unity import MONO, needs_mono
 from tests.clients.test_unity import program as unity_program
+from tests.clients.vectors import CLIENTS
 from tests.integration import losing
 from tests.integration.losing import until
 from tests.integration.lossy_proxy import LossyProxy
@@ -23,18 +25,30 @@ STATE SAMPLE PROBLEM` with the samples heard by then, the messages of the server
 While its connection is lost it adds an emitter."""
 
 
-@pytest.fixture(params=[pytest.param("unity", marks=needs_mono)])
-def player(request) -> Player:
-    program = request.getfixturevalue(request.param)
-    command = {"unity": [MONO, program]}[request.param]
+def unity_command(request, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+    program = request.getfixturevalue("unity")
+    return [MONO, program, "hear", url, "flat", losing.CLIP, str(seconds), output, str(give_up_after_s)]
 
+
+def godot_command(_, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+    driver = CLIENTS.parent / "tests" / "clients" / "godot_losses.gd"
+    given = {"url": url, "clip": losing.CLIP, "seconds": seconds, "output": output, "give-up-after": give_up_after_s}
+    options = [f"--{name}={value}" for name, value in given.items()]
+    return [GODOT, "--path", CLIENTS / "godot", "-s", driver, *options]
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(unity_command, marks=needs_mono, id="unity"),
+        pytest.param(godot_command, marks=needs_godot, id="godot"),
+    ]
+)
+def player(request) -> Player:
     @contextmanager
     def play(address: str, seconds: float, output: Path, *, give_up_after_s: float = 60.0) -> Iterator[Iterator[str]]:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        command = request.param(request, f"ws://{address}/v1/stream", seconds, output, give_up_after_s)
+        with subprocess.Popen(command, env=QUIET, stdout=subprocess.PIPE, text=True) as process:
             try:
-                url = f"ws://{address}/v1/stream"
-                process.stdin.write(f"hear {url} flat {losing.CLIP} {seconds} {output} {give_up_after_s}\n")
-                process.stdin.close()
                 yield process.stdout
             finally:
                 process.kill()

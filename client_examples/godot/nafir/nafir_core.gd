@@ -1,5 +1,5 @@
-# A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and frames to play. It keeps the wanted state (poses,
-# emitters), and says it again in every new connection.
+# A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and frames to play. It keeps what is wanted (poses,
+# emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
 #
 # Godot 3 and Godot 4 both read this file: it names nothing that only one of them has, and declares no types.
 #
@@ -12,12 +12,25 @@ const FULL_SCALE = 32767.0
 const ACKNOWLEDGE_EVERY = 4 # blocks
 const BLOCKS_AHEAD = 4
 const POSE_INTERVAL_S = 0.012
+const PING_INTERVAL_S = 1.0
 const SILENCE_S = 4.0 # a server that sends audio is never silent for so long
-const RETRY_S = [0.25, 0.5, 1.0, 2.0, 4.0]
+const RETRY_S = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 15.0]
+const MOST_ORDERS = 1024
+# Errors after which the server ends the connection, which not every version of Godot tells.
+const LAST_WORDS = ["server_draining", "taken_over", "key_expired", "key_revoked", "stalled", "reads_too_slowly"]
+const LATE = 2 # a flag of blocks
+const FADE_S = 0.005
+const MIX_S = 0.012 # what a mixer takes at once
 const MOST_S = 0.25 # what is more than this above the target is skipped
 const CORRECTION_S = 10.0
 const MOST_CORRECTION = 0.002 # three cents
 const SMOOTHING_S = 1.0
+
+# The stream is live, was lost ("waiting", with the reason in `problem`) or is over ("refused", "lost").
+signal state_changed(state)
+# The clip of an emitter is over, with its reverberation, or cannot be played on after a loss.
+signal emitter_ended(id)
+signal emitter_refused(id, problem)
 
 var scene = "apartment"
 var wanted_rate = 0 # 44100, 48000 or 96000; 0 takes the scene's own
@@ -25,29 +38,52 @@ var block_size = 256
 var buffer_blocks = 8
 var target_s = 0.08 # held back against a network that stalls, and a game that draws slowly
 
-var state = "closed" # connecting, live, waiting, refused
+var give_up_after_s = 300.0 # for so long a server that is gone is tried again
+
+var state = "closed" # connecting, live, waiting, refused, lost
 var problem = "" # why the stream was refused or last lost
 var sample_rate = 0 # of the stream; 0 before the welcome
+var sample_clock = 0 # of the frame after the newest block; goes on over lost connections
 var level = ""
 var heard_pose_id = 0
 var heard_reverberation_pose_id = 0
 var underruns = 0
+# Counts run over all connections. A block is skipped by the server, or lost with a connection.
+var statistics = {
+	"blocks": 0, "blocks_late": 0, "blocks_skipped": 0, "reconnections": 0, "resumptions": 0, "round_trip_s": 0.0,
+}
 var texts = [] # dictionaries to send
 var packets = [] # StreamPeerBuffers to send
 
 var _listener = {"position": [0.0, 0.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0]}
 var _listener_moved = false
 var _emitters = {} # by id
+var _wanted_level = ""
+var _shots = 0
 var _pose_id = 0
 var _since_poses_s = 0.0
+var _ping_id = 0
+var _since_ping_s = 0.0
+var _frame_s = 0.0 # of the game, to which time is known
 var _silent_s = 0.0
 var _wait_s = 0.0
 var _attempt = 0
-var _was_refused = false
-var _retry_after_s = 0.0
+var _is_trying = false # while there is a connection that has not been welcomed
+var _since_lost_s = 0.0
+var _since_block_s = 0.0
+var _last_error = null # of the whole stream, in this connection
+var _token = "" # with which, or
+var _snapshot = "" # with which, the stream is resumed
+var _last_block = null # {sequence, sample_clock} of the newest in this stream of the server's
+var _next_clock = -1 # of the server
+var _clock_offset = 0 # what is added to it
+var _orders = [] # the newest messages that the server counts, and how many there were
+var _ordered = 0
 var _blocks = [] # of frames, in order
 var _first = 0 # frame of the first block that is played next
 var _waiting_frames = 0
+var _tail = [] # frames of a fade that are still to be played
+var _gain = 0.0 # of a fade in
 var _room = 0 # frames that an empty generator takes
 var _playing = false
 var _smooth = 0.0
@@ -93,36 +129,76 @@ func set_listener(pose):
 		_listener_moved = true
 
 
-# Adds an emitter, or moves the one with this id. Without a clip (null) it plays what push_dry gives it.
-func set_emitter(id, clip, pose, gain_db):
+# Adds an emitter, or moves the one with this id. Without a clip (null) it plays what push_dry gives it. `options` are further fields of
+# add_emitter: loop, start_at, stop_at, offset_s, loop_start_s, loop_end_s, remove_when_ended, jitter_ms, directivity. Clocks are those of
+# `sample_clock`.
+func set_emitter(id, clip, pose, gain_db, options = {}):
 	if _emitters.has(id) and _emitters[id].clip == clip:
 		var emitter = _emitters[id]
 		if emitter.gain_db != gain_db:
-			emitter.gain_db = gain_db
-			_say({"type": "set_gain", "id": id, "gain_db": gain_db})
+			set_gain(id, gain_db)
 		if not _same(emitter.pose, pose):
 			emitter.pose = pose
 			emitter.moved = true
 		return
 	remove_emitter(id)
 	_emitters[id] = {
-		"clip": clip, "gain_db": gain_db, "pose": pose, "moved": false,
+		"clip": clip, "gain_db": gain_db, "pose": pose, "options": options, "moved": false,
+		"number": 0, # of the order that adds it
+		"is_stopped": false, "is_refused": false, "ask_again_s": 0.0,
 		"dry": [], "taken": 0, # samples that wait, and how many of them are gone
+		"recent": [0.0, 0.0, 0.0, 0.0], "between": 0.0, # of samples at another rate, and where between the middle two the next one is
 		"sequence": 0, "start": -1, "sent": 0,
 	}
 	_add(id)
 
 
+# Plays a clip once, as soon as it can be heard or from a clock on. Returns the id of its emitter, which is removed once the clip and its
+# reverberation are over.
+func play_once(clip, pose, gain_db = 0.0, start_at = -1):
+	_shots += 1
+	var id = "shot%d" % _shots
+	var options = {"loop": false, "remove_when_ended": true}
+	if start_at >= 0:
+		options["start_at"] = start_at
+	set_emitter(id, clip, pose, gain_db, options)
+	return id
+
+
+# Changes a gain over some seconds, linearly in decibels.
+func set_gain(id, gain_db, ramp_s = 0.0):
+	if _emitters.has(id):
+		_emitters[id].gain_db = gain_db
+		_order({"type": "set_gain", "id": id, "gain_db": gain_db, "ramp_s": ramp_s})
+
+
+# Lets a clip fade out from a clock on, or at once. `emitter_ended` follows.
+func stop_emitter(id, stop_at = -1, fade_s = 0.01):
+	if not _emitters.has(id) or _emitters[id].clip == null:
+		return
+	_emitters[id].is_stopped = true
+	var message = {"type": "stop_emitter", "id": id, "fade_s": fade_s}
+	if stop_at >= 0:
+		message["stop_at"] = _server_clock(stop_at)
+	_order(message)
+
+
 func remove_emitter(id):
 	if _emitters.has(id):
 		_emitters.erase(id)
-		_say({"type": "remove_emitter", "id": id})
+		_order({"type": "remove_emitter", "id": id})
+
+
+# Chooses a quality level, or "auto".
+func set_level(name):
+	_wanted_level = name
+	_order({"type": "set_level", "level": name})
 
 
 # Takes the next samples of a live emitter, numbers at the stream's rate. Samples that come before the emitter is heard, or while a second
 # of them waits, are dropped.
 func push_dry(id, samples):
-	if not _emitters.has(id) or _emitters[id].start < 0:
+	if state != "live" or not _emitters.has(id) or _emitters[id].start < 0:
 		return
 	var emitter = _emitters[id]
 	if emitter.dry.size() - emitter.taken > sample_rate:
@@ -137,51 +213,149 @@ func push_dry(id, samples):
 		emitter.dry.append(each)
 
 
+# The same for frames (Vector2) at another rate, as a microphone has them. Between samples it interpolates.
+func push_dry_frames(id, frames, rate):
+	if not _emitters.has(id) or sample_rate == 0:
+		return
+	var emitter = _emitters[id]
+	var recent = emitter.recent
+	var pace = float(rate) / sample_rate
+	var samples = []
+	for frame in frames:
+		recent.pop_front()
+		recent.append(0.5 * (frame.x + frame.y))
+		while emitter.between < 1.0:
+			var t = emitter.between
+			var slope = 0.5 * (recent[2] - recent[0])
+			var next_slope = 0.5 * (recent[3] - recent[1])
+			var curve = 3.0 * (recent[2] - recent[1]) - 2.0 * slope - next_slope
+			var twist = 2.0 * (recent[1] - recent[2]) + slope + next_slope
+			samples.append(recent[1] + t * (slope + t * (curve + t * twist)))
+			emitter.between += pace
+		emitter.between -= 1.0
+	push_dry(id, samples)
+
+
 # ---- the connection, whose socket is another's
 
 func begin():
-	state = "connecting"
+	if state != "waiting":
+		_become("connecting")
+	_is_trying = true
 	_silent_s = 0.0
-	_was_refused = false
-	_retry_after_s = 0.0
+	_last_error = null
 
 
 # The first message of a connection.
-func hello():
-	var message = {
-		"type": "hello", "protocol": PROTOCOL, "scene": scene, "block_size": block_size, "encoding": "s16",
-		"buffer_blocks": buffer_blocks, "listener": _listener,
-	}
-	if wanted_rate > 0:
-		message["sample_rate"] = wanted_rate
+func first_message():
+	if not _can_resume():
+		return hello()
+	var message = {"type": "resume", "protocol": PROTOCOL}
+	if _token != "":
+		message["token"] = _token
+	if _snapshot != "":
+		message["snapshot"] = _snapshot
+	if _last_block != null:
+		message["sequence"] = _last_block.sequence
+		message["sample_clock"] = _last_block.sample_clock
 	return message
 
 
-# The connection has ended, or there came none.
-func lost(why):
-	if not _was_refused:
-		problem = why
+func hello():
+	var message = {
+		"type": "hello", "protocol": PROTOCOL, "scene": scene, "block_size": block_size, "encoding": "s16",
+		"buffer_blocks": buffer_blocks, "snapshots": true, "listener": _listener,
+	}
+	if wanted_rate > 0:
+		message["sample_rate"] = wanted_rate
+	if _wanted_level != "":
+		message["level"] = _wanted_level
+	return message
+
+
+# The connection has ended, with a close code if there was one, or there came none.
+func lost(why, code = 0):
 	texts.clear()
 	packets.clear()
-	if _was_refused and _retry_after_s == 0.0:
-		state = "refused"
+	_is_trying = false
+	if state == "live":
+		_attempt = 0
+		_since_lost_s = 0.0
+	problem = why
+	var advised_s = 0.0
+	if _last_error != null:
+		problem = "%s: %s" % [_last_error["code"], _last_error["message"]]
+		if _last_error.get("retry_after_s") != null:
+			advised_s = float(_last_error["retry_after_s"])
+		if _last_error["code"] == "unknown_resume_token" and _can_resume():
+			_forget() # begins anew
+			_wait_s = 0.0
+			return
+	var was_refused = _last_error != null and (state != "live" or _last_error["code"] in LAST_WORDS)
+	if advised_s == 0.0 and (_is_final(code) or was_refused):
+		_become("refused")
 		return
-	_attempt = 0 if state == "live" else _attempt + 1
-	state = "waiting"
-	_wait_s = _retry_after_s if _retry_after_s > 0.0 else RETRY_S[int(min(_attempt, RETRY_S.size() - 1))]
+	# With chance, so that the clients of a server that comes back do not all come at once.
+	_wait_s = advised_s if advised_s > 0.0 else RETRY_S[int(min(_attempt, RETRY_S.size() - 1))] * _between(0.5, 1.0)
+	_attempt += 1
+	_become("waiting" if _since_lost_s + _wait_s <= give_up_after_s else "lost")
+
+
+# Close codes after which a new connection would do no better.
+static func _is_final(code):
+	return code in [1000, 1002, 1003, 1007, 1008, 1009, 1010] or (code >= 4400 and code < 4500)
+
+
+static func _between(least, most):
+	return least + (most - least) * (randi() % 1024) / 1024.0
+
+
+func _can_resume():
+	return _token != "" or _snapshot != ""
+
+
+# Lets go of the stream that there was, so that the next connection begins anew.
+func _forget():
+	_token = ""
+	_snapshot = ""
+	_orders.clear()
+	_ordered = 0
+
+
+func _become(next):
+	if state != next:
+		state = next
+		emit_signal("state_changed", next)
 
 
 # Time passes. Returns what is to be done: "connect", "drop" (the server is silent) or "".
 func step(delta_s):
-	if state == "waiting":
+	_frame_s = delta_s
+	_since_block_s += delta_s
+	if state != "live":
+		_since_lost_s += delta_s
+	if state == "waiting" and not _is_trying:
 		_wait_s -= delta_s
 		return "connect" if _wait_s <= 0.0 else ""
-	if state == "connecting" or state == "live":
+	if _is_trying or state == "live":
 		_silent_s += delta_s
-		if _silent_s > SILENCE_S:
+		if _silent_s > SILENCE_S or (_last_error != null and _last_error["code"] in LAST_WORDS):
 			return "drop"
+	if state != "live":
+		return ""
+	_since_ping_s += delta_s
+	if _since_ping_s >= PING_INTERVAL_S:
+		_since_ping_s = 0.0
+		_ping_id += 1
+		_say({"type": "ping", "id": _ping_id})
+	for id in _emitters:
+		var emitter = _emitters[id]
+		if emitter.is_refused and emitter.ask_again_s > 0.0:
+			emitter.ask_again_s -= delta_s
+			if emitter.ask_again_s <= 0.0:
+				_add(id)
 	_since_poses_s += delta_s
-	if state == "live" and _since_poses_s >= POSE_INTERVAL_S:
+	if _since_poses_s >= POSE_INTERVAL_S:
 		_since_poses_s = 0.0
 		_say_poses()
 	return ""
@@ -196,33 +370,107 @@ func receive(message):
 		"welcome":
 			_welcome(message)
 		"error":
-			problem = "%s: %s" % [message["code"], message["message"]]
-			if state != "live":
-				_was_refused = true
-				if message.has("retry_after_s") and message["retry_after_s"] != null:
-					_retry_after_s = float(message["retry_after_s"])
+			_refused(message)
+		"snapshot":
+			_snapshot = message["snapshot"]
+			_handled(int(message["handled"]))
 		"level_changed":
 			level = message["level"]
+		"pong":
+			if int(message["id"]) == _ping_id:
+				statistics.round_trip_s = _since_ping_s + _frame_s
 		"emitter_added":
 			if _emitters.has(message["id"]):
-				_emitters[message["id"]].start = int(message["sample_clock"])
+				_open(_emitters[message["id"]], int(message["sample_clock"]))
+		"emitter_ended":
+			if message["removed"]:
+				_emitters.erase(message["id"])
+			emit_signal("emitter_ended", message["id"])
+
+
+func _refused(error):
+	problem = "%s: %s" % [error["code"], error["message"]]
+	var id = error.get("emitter")
+	if id == null:
+		_last_error = error
+		return
+	if not _emitters.has(id):
+		return
+	var emitter = _emitters[id]
+	if emitter.start < 0:
+		emitter.is_refused = true
+		emitter.ask_again_s = float(error["retry_after_s"]) if error.get("retry_after_s") != null else 0.0
+		emit_signal("emitter_refused", id, problem)
+	elif error["code"] == "unknown_emitter" and _plays_once(emitter):
+		_emitters.erase(id) # its end was said just before the connection was lost
+		emit_signal("emitter_ended", id)
 
 
 func _welcome(message):
-	state = "live"
 	sample_rate = int(message["sample_rate"])
 	level = message["level"]
-	_pose_id = 0
+	_token = message.get("resume_token", "")
 	_listener_moved = true
-	_blocks.clear()
-	_first = 0
-	_waiting_frames = 0
+	_is_trying = false
+	_attempt = 0
+	if statistics.blocks > 0:
+		statistics.reconnections += 1
+	var resumed = message.get("resumed")
+	state = "live" # so that what follows is said; the game is told once it has been
+	if resumed != null:
+		_go_on(int(resumed["handled"]), int(resumed["sample_clock"]), int(resumed["pose_id"]))
+	else:
+		_begin_anew()
+	emit_signal("state_changed", "live")
+
+
+# The server has the stream still: it gets what it has not handled, and where everything is now.
+func _go_on(handled, clock, pose_id):
+	statistics.resumptions += 1
+	_handled(handled)
+	for each in _orders:
+		texts.append(each)
+	_pose_id = int(max(_pose_id, pose_id))
 	for id in _emitters:
-		_emitters[id].start = -1
-		_emitters[id].sequence = 0
-		_emitters[id].sent = 0
-		_emitters[id].moved = false
+		var emitter = _emitters[id]
+		emitter.moved = true
+		# What was added is there, and that it is heard may have been said just before the connection was lost.
+		if emitter.start >= 0 or emitter.number <= handled:
+			_open(emitter, clock)
+
+
+# The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
+func _begin_anew():
+	if _next_clock >= 0:
+		var away_s = max(0.0, _since_block_s - float(buffer_blocks * block_size) / sample_rate)
+		_clock_offset = sample_clock + int(away_s * sample_rate)
+	_next_clock = -1
+	_last_block = null
+	_snapshot = ""
+	_orders.clear()
+	_ordered = 0
+	_pose_id = 0
+	for id in _emitters.keys():
+		var emitter = _emitters[id]
+		if emitter.start >= 0 and _plays_once(emitter):
+			_emitters.erase(id)
+			emit_signal("emitter_ended", id)
+			continue
+		emitter.start = -1
+		emitter.sequence = 0
+		emitter.moved = false
 		_add(id)
+
+
+func _plays_once(emitter):
+	return emitter.clip != null and (emitter.is_stopped or not emitter.options.get("loop", true))
+
+
+# The server hears the emitter from a clock on, and has no samples of it yet.
+func _open(emitter, clock):
+	emitter.start = clock
+	emitter.sent = 0
+	emitter.taken = emitter.dry.size()
 
 
 # Takes a binary message in a StreamPeerBuffer. Returns whether it was a block; another kind, or a damaged one, changes nothing.
@@ -233,6 +481,17 @@ func receive_block(data):
 		return false
 	heard_pose_id = block.pose_id
 	heard_reverberation_pose_id = block.reverberation_pose_id
+	statistics.blocks += 1
+	if block.flags & LATE:
+		statistics.blocks_late += 1
+	if block.sample_clock != _next_clock:
+		if _next_clock >= 0:
+			statistics.blocks_skipped += int((block.sample_clock - _next_clock) / block.frames.size())
+		_end_sound()
+	_last_block = {"sequence": block.sequence, "sample_clock": block.sample_clock}
+	_next_clock = block.sample_clock + block.frames.size()
+	sample_clock = _next_clock + _clock_offset
+	_since_block_s = 0.0
 	_blocks.append(block.frames)
 	_waiting_frames += block.frames.size()
 	if block.sequence % ACKNOWLEDGE_EVERY == ACKNOWLEDGE_EVERY - 1:
@@ -301,14 +560,25 @@ static func serialize_dry_block(id, sequence, samples):
 
 func _add(id):
 	var emitter = _emitters[id]
+	emitter.is_refused = false
 	var message = {"type": "add_emitter", "id": id, "gain_db": emitter.gain_db}
 	message["position"] = emitter.pose.position
 	message["orientation"] = emitter.pose.orientation
+	for name in emitter.options:
+		message[name] = emitter.options[name]
+	for name in ["start_at", "stop_at"]:
+		if message.has(name):
+			message[name] = _server_clock(message[name])
 	if emitter.clip == null:
 		message["live"] = true
 	else:
 		message["clip"] = emitter.clip
-	_say(message)
+	_order(message)
+	emitter.number = _ordered
+
+
+func _server_clock(clock):
+	return int(max(0, clock - _clock_offset))
 
 
 func _send_dry(id, block):
@@ -338,6 +608,27 @@ static func _same(a, b):
 	return true
 
 
+# Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted when it does.
+func _order(message):
+	if state != "live" and not _can_resume():
+		return
+	_orders.append(message)
+	_ordered += 1
+	if _orders.size() > MOST_ORDERS:
+		_orders.pop_front()
+		if state != "live":
+			_forget() # too much was said to go on with the stream
+	if state == "live":
+		texts.append(message)
+
+
+# So many orders need not be sent again.
+func _handled(count):
+	while _orders.size() > 0 and _ordered - _orders.size() < count:
+		_orders.pop_front()
+
+
+# Says what a lost connection makes idle.
 func _say(message):
 	if state == "live":
 		texts.append(message)
@@ -346,7 +637,7 @@ func _say(message):
 func _say_poses():
 	for id in _emitters:
 		var emitter = _emitters[id]
-		if emitter.moved:
+		if emitter.moved and not emitter.is_refused:
 			emitter.moved = false
 			_pose_id += 1
 			_say({
@@ -362,40 +653,87 @@ func _say_poses():
 # ---- playing
 
 # Gives an AudioStreamGeneratorPlayback what it takes. Returns the pitch_scale of its player, which makes up for the difference between
-# the server's clock and the sound card's.
+# the server's clock and the sound card's. The last frames are kept until others follow, since they fade out if none do.
 func play(generator, delta_s):
+	if sample_rate == 0:
+		return 1.0
 	var free = generator.get_frames_available()
 	_room = max(_room, free)
+	while free > 0 and _tail.size() > 0:
+		generator.push_frame(_tail.pop_front())
+		free -= 1
 	var target = target_s * sample_rate
-	var fill = _waiting_frames + _room - free
+	var fade = int(FADE_S * sample_rate)
+	var queued = _room - free
+	var fill = _waiting_frames + queued
 	if not _playing:
-		if _waiting_frames < target or sample_rate == 0:
+		if fill < target or _tail.size() > 0:
 			return 1.0
 		_playing = true
 		_smooth = target
-		_skip(_waiting_frames - target)
-	elif fill <= 0:
-		_playing = false
-		underruns += 1
-		return 1.0
-	elif fill > target + MOST_S * sample_rate:
+		_gain = 0.0
 		_skip(fill - target)
-	while free > 0 and _waiting_frames > 0:
+	elif _waiting_frames <= fade and queued < (delta_s + MIX_S) * sample_rate:
+		underruns += 1
+		_end_sound()
+		return play(generator, delta_s)
+	elif queued <= 0 and fill > target: # the game drew too slowly, and nothing was heard meanwhile
+		underruns += 1
+		_gain = 0.0
+		_skip(fill - target)
+	elif fill > target + MOST_S * sample_rate:
+		_fade_out()
+		_skip(fill - target)
+		return play(generator, delta_s)
+	while free > 0 and _waiting_frames > fade:
+		if _gain < 1.0:
+			generator.push_frame(_take_frame())
+			free -= 1
+			continue
 		var block = _blocks[0]
-		generator.push_frame(block[_first])
-		_first += 1
-		_waiting_frames -= 1
-		free -= 1
-		if _first == block.size():
-			_blocks.pop_front()
-			_first = 0
+		var count = int(min(min(free, _waiting_frames - fade), block.size() - _first))
+		for index in range(_first, _first + count):
+			generator.push_frame(block[index])
+		free -= count
+		_skip(count)
 	_smooth += min(1.0, delta_s / SMOOTHING_S) * (fill - _smooth)
 	var correction = (_smooth - target) / (CORRECTION_S * sample_rate)
 	return 1.0 + max(-MOST_CORRECTION, min(MOST_CORRECTION, correction))
 
 
+# What waits to be played does not go on: it fades out, and what comes next fades in, once enough of it waits.
+func _end_sound():
+	if _playing:
+		_fade_out()
+	_playing = false
+	_blocks.clear()
+	_first = 0
+	_waiting_frames = 0
+
+
+func _fade_out():
+	var fade = int(min(FADE_S * sample_rate, _waiting_frames))
+	for index in range(fade):
+		_tail.append(_take_frame() * (1.0 - (index + 1.0) / fade))
+	_gain = 0.0
+
+
+func _take_frame():
+	var block = _blocks[0]
+	var frame = block[_first]
+	_first += 1
+	_waiting_frames -= 1
+	if _first == block.size():
+		_blocks.pop_front()
+		_first = 0
+	if _gain < 1.0:
+		_gain = min(1.0, _gain + 1.0 / (FADE_S * sample_rate))
+		return frame * _gain
+	return frame
+
+
 func _skip(frames):
-	frames = int(min(frames, _waiting_frames))
+	frames = int(max(0, min(frames, _waiting_frames)))
 	while frames > 0:
 		var some = min(frames, _blocks[0].size() - _first)
 		_first += some

@@ -1,6 +1,11 @@
 # Hears a scene of a Nafir server. Godot 3: a child of the camera, so that it moves with it.
 extends Spatial
 
+# The stream is "live", was lost and is being tried again ("waiting"), or is over ("refused", "lost"). `core.problem` says why.
+signal state_changed(state)
+# The clip of an emitter is over, with its reverberation.
+signal emitter_ended(id)
+
 const Core = preload("nafir_core.gd")
 
 export var url = "ws://127.0.0.1:8000/v1/stream"
@@ -8,12 +13,15 @@ export var scene = "apartment"
 export var key = "" # an API key or token, if the server asks for one
 export var buffer_s = 0.08
 export var sample_rate = 48000 # or 44100 or 96000; 0 takes the scene's own
+export var give_up_after_s = 300.0 # for so long a server that is gone is tried again
 export(NodePath) var origin # the node at the scene's origin; empty if that is the world's
 
 var core = Core.new()
 var _socket
 var _has_ended = false
-var _nodes = {} # id -> {node, clip, gain_db}
+var _why = "" # the connection has ended
+var _code = 0
+var _nodes = {} # id -> {node, clip, gain_db, options}
 var _player = AudioStreamPlayer.new()
 
 
@@ -21,18 +29,41 @@ func _ready():
 	core.scene = scene
 	core.wanted_rate = sample_rate
 	core.target_s = buffer_s
+	core.give_up_after_s = give_up_after_s
+	core.connect("state_changed", self, "_on_core_state_changed")
+	core.connect("emitter_ended", self, "_on_core_emitter_ended")
+	core.connect("emitter_refused", self, "_on_core_emitter_refused")
+	randomize()
 	add_child(_player)
 	_open()
 
 
-# The emitter plays a clip of the server at the node, wherever that moves; with null, what core.push_dry gives it.
-func add_emitter(id, node, clip = null, gain_db = 0.0):
-	_nodes[id] = {"node": node, "clip": clip, "gain_db": gain_db}
+# The emitter plays a clip of the server at the node, wherever that moves; with null, what core.push_dry gives it. `options` are those of
+# core.set_emitter.
+func add_emitter(id, node, clip = null, gain_db = 0.0, options = {}):
+	_nodes[id] = {"node": node, "clip": clip, "gain_db": gain_db, "options": options}
 
 
 func remove_emitter(id):
 	_nodes.erase(id)
 	core.remove_emitter(id)
+
+
+# Plays a clip once at the node's present place. Returns the id of its emitter.
+func play_once(clip, node, gain_db = 0.0):
+	return core.play_once(clip, pose_of(node), gain_db)
+
+
+# Changes a gain over some seconds, linearly in decibels.
+func set_gain(id, gain_db, ramp_s = 0.0):
+	if _nodes.has(id):
+		_nodes[id].gain_db = gain_db
+	core.set_gain(id, gain_db, ramp_s)
+
+
+# Lets a clip fade out; `emitter_ended` follows.
+func stop_emitter(id, fade_s = 0.01):
+	core.stop_emitter(id, -1, fade_s)
 
 
 func pose_of(node):
@@ -50,13 +81,23 @@ func _open():
 	_socket.connect("connection_established", self, "_opened")
 	_socket.connect("connection_error", self, "_ended")
 	_socket.connect("connection_closed", self, "_ended")
+	_socket.connect("server_close_request", self, "_closing")
 	_socket.connect("data_received", self, "_received")
 	var headers = [] if key == "" else ["Authorization: Bearer %s" % key]
+	_why = "no connection to %s" % url
+	_code = 0
 	_has_ended = _socket.connect_to_url(url, [], false, headers) != OK
 
 
 func _opened(_protocol):
-	_send_text(core.hello())
+	_why = "the connection was lost"
+	_send_text(core.first_message())
+
+
+func _closing(code, reason):
+	_why = "closed with %d: %s" % [code, reason]
+	_code = code
+	_has_ended = true # not every server ends the connection itself after that
 
 
 # Called while the socket polls, so that it must not be let go of yet.
@@ -64,9 +105,22 @@ func _ended(_was_clean = false):
 	_has_ended = true
 
 
-func _lost(why):
+func _lost(why, code = 0):
 	_socket = null
-	core.lost(why)
+	core.lost(why, code)
+
+
+func _on_core_state_changed(state):
+	emit_signal("state_changed", state)
+
+
+func _on_core_emitter_ended(id):
+	_nodes.erase(id)
+	emit_signal("emitter_ended", id)
+
+
+func _on_core_emitter_refused(id, problem):
+	push_warning("Nafir: emitter %s: %s" % [id, problem])
 
 
 func _received():
@@ -84,11 +138,11 @@ func _process(delta):
 	if _socket != null:
 		_socket.poll()
 		if _has_ended:
-			_lost("no connection to %s" % url)
+			_lost(_why, _code)
 	core.set_listener(pose_of(self))
 	for id in _nodes.keys():
 		if is_instance_valid(_nodes[id].node):
-			core.set_emitter(id, _nodes[id].clip, pose_of(_nodes[id].node), _nodes[id].gain_db)
+			core.set_emitter(id, _nodes[id].clip, pose_of(_nodes[id].node), _nodes[id].gain_db, _nodes[id].options)
 		else:
 			remove_emitter(id)
 	match core.step(delta):
