@@ -111,7 +111,12 @@ class SceneFile(Strict):
     def read(cls, path: Path) -> "SceneFile":
         """Raises SceneFileError naming the file and the first field at fault."""
         try:
-            return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+            if isinstance(content.get("geometry"), dict) and "mesh" in content["geometry"]:
+                raise SceneFileError(
+                    f"{path}: geometry.mesh: is an imported level, and only floor plans are simulated so far"
+                )
+            return cls.model_validate(content)
         except OSError as exc:
             raise SceneFileError(f"{path}: cannot be read: {exc.strerror}") from exc
         except ValidationError as exc:

@@ -1,0 +1,63 @@
+import json
+
+import pytest
+
+from tests.training.data.levels.conftest import room
+from training.cli.main import main
+from training.data.levels.gltf_writer import write_glb
+
+
+@pytest.fixture
+def nafir_train(monkeypatch, capfd):
+    """Runs the command; gives its exit code, standard output and standard error."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["nafir-train", "import-level", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as left:
+            return left.code, *capfd.readouterr()
+        return 0, *capfd.readouterr()
+
+    return run
+
+
+def test_a_level_is_imported_reported_and_drawn(nafir_train, tmp_path):
+    write_glb(tmp_path / "level.glb", [room()])
+    code, out, _ = nafir_train(tmp_path / "level.glb", "-o", tmp_path / "scene")
+    assert code == 0
+    assert "watertight" in out
+    assert "table: plaster" in out
+    assert "12 triangles, 1 materials, 0 doors" in out
+    assert (tmp_path / "scene" / "report.png").stat().st_size > 10_000
+    names = sorted(path.name for path in (tmp_path / "scene").iterdir())
+    assert names == ["geometry.npz", "report.json", "report.png", "scene.toml"]
+
+
+def test_a_refused_level_is_one_line_and_the_json_says_why(nafir_train, tmp_path):
+    write_glb(tmp_path / "level.glb", [room("M_042", without=(4, 10))])
+    code, out, err = nafir_train(tmp_path / "level.glb", "-o", tmp_path / "scene", "--json")
+    assert code == 2
+    assert len(json.loads(out)["problems"]) == 2
+    assert "nobody knows 'M_042'" in err
+    assert "report.png" in err
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["missing.glb"], "there is no such file"),
+        (["level.fbx"], "levels are read from .glb, .gltf, .obj"),
+        (["level.glb", "--merge-within-m", "1"], "--merge-within-m"),
+        (["level.glb", "--default-material", "brik"], "near: brick"),
+        (["level.glb", "--materials", "missing.toml"], "cannot be read"),
+        (["level.glb", "--scene", "9"], "--scene: '9' is no scene"),
+    ],
+)
+def test_options_at_fault_are_told(nafir_train, tmp_path, monkeypatch, arguments, complaint):
+    monkeypatch.chdir(tmp_path)
+    write_glb(tmp_path / "level.glb", [room()])
+    code, _, err = nafir_train(*arguments, "-o", "scene")
+    assert code == 2
+    assert complaint in err

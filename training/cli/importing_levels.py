@@ -1,0 +1,72 @@
+"""`nafir-train import-level`: imports a level of a game, and reports on its mesh."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from server.core.command_line import writable_folder
+from server.core.files import require_matplotlib
+from training.cli.options import Json, Seed
+from training.data.levels.axis_options import Handedness, Units, Up
+
+MOST_MERGED_M = 0.1
+
+
+def import_level(
+    level: Annotated[Path, typer.Argument(help="Level to read: .glb, .gltf or .obj.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)],
+    units: Annotated[
+        Units | None, typer.Option(help="Unit of coordinates; OBJ does not say it, glTF has metres.")
+    ] = None,
+    up: Annotated[Up | None, typer.Option(help="Axis that points up; OBJ does not say it, in glTF it is y.")] = None,
+    handedness: Annotated[Handedness | None, typer.Option(help="Of the axes; right if not given.")] = None,
+    scene: Annotated[str | None, typer.Option(help="Which scene, by name or number, where a file has several.")] = None,
+    materials: Annotated[Path | None, typer.Option(help="TOML file that says what the level's materials are.")] = None,
+    default_material: Annotated[
+        str | None, typer.Option(help="Row of the table for materials that are in neither.")
+    ] = None,
+    is_open: Annotated[bool, typer.Option("--open", help="The level has open sky: sound may leave it.")] = False,
+    merge_within_m: Annotated[
+        float,
+        typer.Option(min=0.0, max=MOST_MERGED_M, help="Merge flat triangles; no surface moves farther. 0 merges none."),
+    ] = 0.005,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Read a level (glTF or OBJ), examine and mend its mesh, and write scene.toml, geometry.npz and a report."""
+    require_matplotlib("import-level")
+    from training.data.levels.level_import import PICTURE_FILE, Choices, write_level
+    from training.data.levels.level_import import import_level as read_level
+    from training.data.levels.level_source import LevelError
+
+    choices = Choices(
+        units,
+        up,
+        handedness,
+        scene,
+        materials,
+        default_material,
+        is_open,
+        merge_within_m,
+        seed,
+    )
+    with Console(stderr=True).status(f"examining {level.name}"):
+        imported = read_level(level, choices)
+        write_level(imported, output)
+    report = imported.report
+    if as_json:
+        typer.echo(json.dumps(report.to_json(), indent=2))
+    else:
+        console = Console()
+        Console(width=None if console.is_terminal else 150).print(report.tables())
+    if imported.scene is None:
+        raise LevelError(level, "refused", f"{'; '.join(report.problems)} (drawn in {output / PICTURE_FILE})")
+    if not as_json:
+        doors, named = len(imported.scene.doors), len(imported.scene.file.geometry.materials)
+        typer.echo(
+            f"{output}: {len(imported.scene.mesh.triangles):,} triangles, {named} materials, {doors} "
+            f"door{'' if doors == 1 else 's'}; drawn in {output / PICTURE_FILE}"
+        )

@@ -1,0 +1,31 @@
+"""Units and axes of a level's file. This module imports nothing heavy, for the command line."""
+
+from enum import StrEnum
+
+
+class Units(StrEnum):
+    """The unit of a file's coordinates."""
+
+    M = "m"
+    CM = "cm"
+    MM = "mm"
+    IN = "in"
+    FT = "ft"
+
+    @property
+    def metres(self) -> float:
+        return {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}[self.value]
+
+
+class Up(StrEnum):
+    """The axis of a file that points up."""
+
+    Y = "y"
+    Z = "z"
+
+
+class Handedness(StrEnum):
+    """Right-handed: seen from the tip of the third axis, the first turns counter-clockwise to the second."""
+
+    RIGHT = "right"
+    LEFT = "left"
