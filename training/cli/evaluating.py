@@ -353,7 +353,10 @@ def fractions(
         return
     for metric in SHOWN:
         for field, by_percent in spreads(found, metric).items():
-            told = [f"{percent:g} %: {mean:.3g} ± {spread:.2g}" for percent, (mean, spread, _) in by_percent.items()]
+            told = [
+                f"{percent:g} %: {mean:.3g}" + (f" ± {spread:.2g}" if runs > 1 else "")
+                for percent, (mean, spread, runs) in by_percent.items()
+            ]
             typer.echo(f"{metric}, {field}: {', '.join(told)}")
 
 
