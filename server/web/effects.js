@@ -89,6 +89,12 @@ export class Effects extends EventTarget {
     for (const row of this.#rows.values()) row.rest();
   }
 
+  /** Shows that everything is rendered in this browser, without a plan. */
+  leave() {
+    this.rest();
+    this.#note.textContent = "all that the field has, in this browser";
+  }
+
   #row(name) {
     if (!this.#rows.has(name)) {
       const row = new Row(name, (isOn) => this.#wish({ [name]: isOn }));

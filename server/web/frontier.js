@@ -1,11 +1,15 @@
 // The plot of accuracy against time: one mark for each quality level on a logarithmic scale of milliseconds, small ones for levels that
 // were measured but are not offered, and the server's messages about the present level.
 //
+// One more level may be chosen: that the scene is rendered in this browser. It is a line at its cost, as measured here while it plays; how
+// accurate first-order ambisonics are through a head is not measured.
+//
 // Errors are means over the metrics in just-noticeable differences (JND); smaller is better.
 
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [296, 132];
 const MARGIN = { left: 26, right: 38, top: 12, bottom: 22 };
+export const HERE = "in-this-browser"; // the level that no server renders
 const KEPT = 3; // messages about changes that stay visible
 const REASONS = {
   chosen: "as you chose",
@@ -13,7 +17,7 @@ const REASONS = {
   recovered: "the server has time again",
 };
 
-const milliseconds = (value) => `${value < 0.1 ? value.toPrecision(1) : value < 1 ? value.toFixed(2) : value.toPrecision(2)} ms`;
+const milliseconds = (value) => `${value < 0.1 ? value.toPrecision(1) : value < 1 ? value.toFixed(2) : Number(value.toPrecision(2))} ms`;
 const costOf = (level) => level.ms_mean ?? level.ms_here;
 // The time measured here is for a new response. With levels that reuse responses, most poses of a walk need none.
 const hereOf = (level) => (level.ms_mean === null || level.ms_here === null ? level.ms_here : (level.ms_here * level.ms_mean) / level.ms_miss);
@@ -35,6 +39,8 @@ export class Frontier extends EventTarget {
   #changes;
   #levels = [];
   #heard = null;
+  #offersHere = false;
+  #msHere = null; // of a response in this browser
   #wish = null; // a level that was chosen before the levels were known
   #history = []; // {at, level, text}, newest first
 
@@ -71,10 +77,28 @@ export class Frontier extends EventTarget {
       option.title = level.name;
       return option;
     });
-    this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options);
-    this.#choice.value = levels.some(({ name }) => name === chosen) ? chosen : "auto";
+    const here = this.#offersHere ? [new Option(this.#titleHere, HERE)] : [];
+    this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options, ...here);
+    this.#choice.value = [...this.#choice.options].some(({ value }) => value === chosen) ? chosen : "auto";
     this.#choice.disabled = false;
     this.#draw();
+  }
+
+  /** Whether the scene can be rendered in this browser. */
+  set offersHere(offersHere) {
+    this.#offersHere = offersHere;
+  }
+
+  /** Takes the median time of a response in this browser, in milliseconds. */
+  set msHere(ms) {
+    this.#msHere = ms;
+    const option = [...this.#choice.options].find(({ value }) => value === HERE);
+    if (option) option.textContent = this.#titleHere;
+    this.#draw();
+  }
+
+  get #titleHere() {
+    return this.#msHere === null ? "In this browser" : `In this browser, ${milliseconds(this.#msHere)}`;
   }
 
   /** Shows the reason why there is nothing to show yet. */
@@ -114,7 +138,8 @@ export class Frontier extends EventTarget {
   }
 
   #draw() {
-    const heard = this.#levels.find(({ name }) => name === this.#heard);
+    const here = { name: HERE, title: "In this browser", ms_mean: null, ms_here: this.#msHere };
+    const heard = [...this.#levels, here].find(({ name }) => name === this.#heard);
     this.#name.textContent = heard ? heard.title : "–";
     this.#name.title = heard ? heard.name : "";
     this.#name.classList.toggle("long", this.#name.textContent.length > 16);
@@ -129,11 +154,13 @@ export class Frontier extends EventTarget {
     if (floors.length > 0) this.#floor(y(Math.min(...floors)));
     const line = [...placed].sort((a, b) => costOf(a) - costOf(b)).map((level) => `${x(costOf(level)).toFixed(1)} ${y(level.audible).toFixed(1)}`);
     draw("path", { class: "through", d: `M${line.join("L")}` }, this.#chart);
+    if (this.#msHere !== null) this.#markHere(x(this.#msHere));
     for (const level of placed) this.#mark(level, x, y);
   }
 
   #axes(placed) {
     const costs = placed.flatMap((level) => [level.ms_mean, hereOf(level)]).filter((cost) => cost !== null);
+    if (this.#msHere !== null) costs.push(this.#msHere);
     // Half a decade on either side, so that the axis has at least one power of ten.
     const low = Math.log10(Math.min(...costs)) - 0.5;
     const high = Math.log10(Math.max(...costs)) + 0.5;
@@ -160,6 +187,12 @@ export class Frontier extends EventTarget {
     draw("path", { class: "floor", d: `M${MARGIN.left} ${at.toFixed(1)}H${WIDTH - MARGIN.right}` }, this.#chart);
     // Beside the plot, so that it covers no point.
     draw("text", { x: WIDTH - MARGIN.right + 6, y: at + 3.5, class: "tick start floor-label" }, this.#chart, "floor");
+  }
+
+  #markHere(at) {
+    const mark = draw("g", { class: this.#heard === HERE ? "in-browser heard" : "in-browser", "data-level": HERE }, this.#chart);
+    draw("path", { d: `M${at.toFixed(1)} ${MARGIN.top}V${HEIGHT - MARGIN.bottom}` }, mark);
+    draw("title", {}, mark, `In this browser: ${milliseconds(this.#msHere)} a response, measured here`);
   }
 
   #mark(level, x, y) {

@@ -5,7 +5,8 @@ import { Comparison } from "./comparison.js";
 import { askForKey, key } from "./access.js";
 import { FloorPlan } from "./floorplan.js";
 import { Effects } from "./effects.js";
-import { Frontier } from "./frontier.js";
+import { Frontier, HERE } from "./frontier.js";
+import { LocalWorkerStream } from "./nafir/field/local_worker_stream.js";
 import { PoseLedger, TurnLedger } from "./nafir/latency.js";
 import { WorkerStream } from "./nafir/worker_stream.js";
 import { Heads } from "./heads.js";
@@ -62,7 +63,9 @@ class Page {
     this.reverberationLedger = new PoseLedger();
     this.turnLedger = new TurnLedger();
     this.turnedAt = 0;
-    this.stream = new WorkerStream();
+    this.remote = new WorkerStream(); // a server's stream
+    this.local = null; // one that is rendered here, once it is wanted
+    this.stream = this.remote; // the one that is heard
     this.connection = "idle";
     this.playing = false;
     this.isFed = false; // whether the visitor's own sounds go into the stream
@@ -158,6 +161,7 @@ class Page {
     this.clips = clips;
     this.world = new World(scene, { mostEmitters });
     this.turning.directionalLevels = scene.directional_levels ?? [];
+    this.frontier.offersHere = (scene.directional_levels ?? []).length > 0;
     // Where nothing reverberates, all that is heard is the direct sound. It is sharper through the filters of the head itself.
     if (scene.levels.every(({ field }) => field === NO_FIELD)) this.turning.usual = "server";
     this.panel.turnsHere = this.turning.isHere;
@@ -219,13 +223,20 @@ class Page {
       this.reverberationLedger.heard({ ...detail, poseId: detail.reverberationPoseId }, this.steady);
     });
     this.player.addEventListener("interrupted", () => this.pause());
+    this.#listenToStream(this.remote);
+  }
+
+  #listenToStream(stream) {
     const handlers = {
       state: (detail) => this.#streamState(detail),
       posed: (detail) => {
         this.ledger.posed(detail);
         this.reverberationLedger.posed(detail);
       },
-      status: (detail) => this.panel.status(detail),
+      status: (detail) => {
+        this.panel.status(detail);
+        if (this.#isHere && detail.ir_ms.p50 !== null) this.frontier.msHere = detail.ir_ms.p50;
+      },
       level: (detail) => {
         this.level = detail.level;
         this.frontier.changed(detail);
@@ -242,7 +253,9 @@ class Page {
         if (code === "unknown_level") fetchFrontier(this.scene.id).then((frontier) => this.#showLevels(frontier), () => {});
       },
     };
-    for (const [type, handle] of Object.entries(handlers)) this.stream.addEventListener(type, ({ detail }) => handle(detail));
+    for (const [type, handle] of Object.entries(handlers)) {
+      stream.addEventListener(type, ({ detail }) => this.stream === stream && handle(detail));
+    }
   }
 
   #listenToControls() {
@@ -354,7 +367,31 @@ class Page {
     this.comparison.show(frontier.levels.filter(({ is_offered: isOffered }) => isOffered).reverse());
   }
 
-  #useLevel(name) {
+  /** Whether the stream that is heard is rendered in this browser. */
+  get #isHere() {
+    return this.stream === this.local;
+  }
+
+  /** Takes the stream that the chosen level needs. */
+  #chooseStream() {
+    if (this.frontier.chosen !== HERE) this.stream = this.remote;
+    else {
+      if (!this.local) this.#listenToStream((this.local = new LocalWorkerStream()));
+      this.stream = this.local;
+    }
+    this.turning.level = this.#isHere ? "auto" : this.frontier.chosen;
+    this.panel.rendersHere = this.#isHere;
+  }
+
+  async #useLevel(name) {
+    if (this.#isHere || name === HERE) {
+      if (this.#isHere === (name === HERE)) return;
+      const wasPlaying = this.playing;
+      await this.pause();
+      this.#chooseStream();
+      if (wasPlaying) await this.play();
+      return;
+    }
     this.turning.level = name;
     if (!this.#renewed({ level: name })) this.#tell("level", { name });
   }
@@ -380,12 +417,13 @@ class Page {
     if (missing.size > 0) this.notices.show("situation", `This server has no clip ${[...missing].map((name) => `“${name}”`).join(", ")}.`);
     if (world.emitters.size === 0 && clips.length > 0) world.addEmitter({ clip: clips[0].name, position: scene.emitter.position });
     if (!shared) return;
-    if (scene.levels.some(({ name }) => name === shared.level)) this.frontier.chosen = shared.level;
+    const isHere = shared.level === HERE && this.turning.isPossible;
+    if (isHere || scene.levels.some(({ name }) => name === shared.level)) this.frontier.chosen = shared.level;
     this.heads.wish = shared.head ?? null;
     this.effects.restore(shared);
     this.heads.used = this.turning.used = this.effects.wishes.output !== "mono";
     this.turning.chosen = shared.turning;
-    this.turning.level = this.frontier.chosen;
+    this.#chooseStream();
   }
 
   async #share() {
@@ -425,7 +463,7 @@ class Page {
   }
 
   get #wantedOutput() {
-    return this.turning.isHere ? "ambisonics" : this.effects.wishes.output;
+    return this.turning.isHere || this.#isHere ? "ambisonics" : this.effects.wishes.output;
   }
 
   /** What a hello says of the output. Ambisonic sound is decoded here, whatever head the server has. */
@@ -490,11 +528,11 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
-    this.turning.level = this.frontier.chosen;
+    this.#chooseStream();
     const hello = {
       scene: this.scene.id,
       sampleRate: this.scene.sample_rate,
-      level: this.frontier.chosen,
+      level: this.#isHere ? undefined : this.frontier.chosen,
       effects: this.effects.wishes.effects,
       ...this.#outputNow(),
     };
@@ -557,7 +595,8 @@ class Page {
     } else if (state === "live") {
       this.#setConnection("live", "Live");
       const { welcome } = detail;
-      this.frontier.heard = this.level = welcome.level;
+      this.frontier.heard = this.level = this.#isHere ? HERE : welcome.level;
+      if (this.#isHere) this.effects.leave();
       this.head = this.output === "ambisonics" ? this.decoded : welcome.hrtf;
       this.panel.turnsHere = this.output === "ambisonics";
       this.world.mostEmitters = welcome.max_emitters;

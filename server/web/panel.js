@@ -71,6 +71,11 @@ export class Panel {
     this.#find("turn").hidden = this.#find("turn-part").hidden = !isHere;
   }
 
+  /** Whether the sound is rendered in this browser and not on the server. */
+  set rendersHere(isHere) {
+    this.#find("part-server-name").textContent = isHere ? "This browser" : "Server and network";
+  }
+
   /** Shows a worklet report and the latencies of direct sound, reflected field and turns. Returns the meters' lengths for both ears. */
   report(report, latency, reverberation, turn) {
     const at = performance.now();

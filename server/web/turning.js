@@ -25,6 +25,11 @@ export class Turning extends EventTarget {
     });
   }
 
+  /** Whether a level of the scene knows from where sound arrives. */
+  get isPossible() {
+    return this.#levels.length > 0;
+  }
+
   /** Whether the browser is to turn the sound. */
   get isHere() {
     return this.#choice.value === "browser" && this.#isUsed;
@@ -74,7 +79,7 @@ export class Turning extends EventTarget {
   }
 
   #show() {
-    const isPossible = this.#levels.length > 0;
+    const { isPossible } = this;
     const isOfLevel = this.#level === "auto" || this.#levels.includes(this.#level);
     this.#choice.disabled = !isPossible || !isOfLevel || !this.#isUsed;
     this.#choice.value = isPossible && isOfLevel ? this.#wish : "server";

@@ -51,7 +51,7 @@ function answerer(field, stream) {
   return ({ type, id, poseId, listener, emitter }) => {
     if (type === "open") {
       const longestS = field.longestM / field.speedOfSound;
-      stream().receive({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS });
+      stream().receive({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS, ms: 1 });
     }
     if (type !== "place") return;
     try {

@@ -1,6 +1,7 @@
 """Quality levels on the page: the frontier is a picture to choose from while one listens."""
 
 import re
+import urllib.request
 from collections.abc import Iterator
 
 import numpy as np
@@ -53,10 +54,10 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     assert measured.get_attribute("data-level") == "near"
     assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
     options = page.locator("#level-choice option").all()
-    plain = ["Automatic", "Full, fine", "Full, standard", "At most 20 responses a second"]
+    plain = ["Automatic", "Full, fine", "Full, standard", "At most 20 responses a second", "In this browser"]
     shown = [option.inner_text() for option in options]
     assert [re.sub(", [^ ]+ ms$", "", text) for text in shown] == plain
-    assert [option.get_attribute("title") for option in options] == [None, "fine", "standard", "quick"]
+    assert [option.get_attribute("title") for option in options] == [None, "fine", "standard", "quick", None]
     titles = page.locator("#frontier title").all_text_contents()
     assert any(title.startswith("At most 20 responses a second (quick): error") for title in titles)
 
@@ -84,4 +85,40 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     page.wait_for_function("nafir.state().level === null")
     start(page)
     page.wait_for_function("nafir.state().level === 'fine'")
+    context.close()
+
+
+def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_levels):
+    def streams() -> float:
+        metrics = urllib.request.urlopen(f"{several_levels}/metrics", timeout=10).read().decode()
+        counts = re.findall(r"^nafir_streams\{.*\} ([0-9.]+)$", metrics, re.MULTILINE)
+        return sum(map(float, counts))
+
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    complaints: list[str] = []
+    context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    page = open_page(context, several_levels)
+    start(page)
+    page.select_option("#level-choice", "in-this-browser")
+    page.wait_for_function("nafir.state().level === 'in-this-browser' && nafir.state().latency !== null")
+    assert page.inner_text("#level") == "In this browser"
+    page.wait_for_function("document.getElementById('field-cost').textContent.endsWith(' ms')")
+    assert page.locator("#frontier .in-browser.heard").count() == 1
+    assert re.fullmatch(r"[0-9.]+\sms\shere", page.inner_text("#level-note"))
+    assert page.inner_text("#part-server-name") == "This browser"
+    assert level_db(listen(page)).max() > -60
+    # A step is heard, without the server.
+    page.evaluate("nafir.setListener({ x: 2.6 })")
+    state = page.evaluate("nafir.state()")
+    assert (state["connection"], state["output"], state["effects"]) == ("live", "ambisonics", None)
+    assert streams() == 0
+
+    page.select_option("#level-choice", "standard")
+    page.wait_for_function("nafir.state().level === 'standard'")
+    assert page.inner_text("#part-server-name") == "Server and network"
+    assert page.locator("#frontier .in-browser.heard").count() == 0
+    assert streams() == 1
+    assert level_db(listen(page)).max() > -60
+    assert complaints == []
     context.close()

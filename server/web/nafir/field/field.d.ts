@@ -38,6 +38,7 @@ export class Field {
   directPath(listener: Position, emitter: Position): DirectPath;
   /** The minimum-phase filter of a direct path at `sampleRate`: edges, air and distance, without its delay. */
   directFilter(path: DirectPath): Float64Array;
+  readonly start: { listener: Position; emitter: Position };
   /** Throws RangeError, with `name` in its message. */
   requireInside(position: Position, name: string): void;
 }

@@ -120,6 +120,13 @@ export class Field {
     throw new RangeError(`${name} (${position.join(", ")}) is not inside scene ${this.#manifest.id}`);
   }
 
+  /** Where a visit of the scene begins: {listener, emitter}, two positions. */
+  get start() {
+    const { bounds: { minimum, maximum }, start } = this.#manifest;
+    const middle = minimum.map((low, axis) => (low + maximum[axis]) / 2);
+    return { listener: start?.listener ?? middle, emitter: start?.emitter ?? middle };
+  }
+
   /** The direct sound: {lengthM, arrival, gainDb}, the length of its path, the direction from the listener, and gains of edges per band. */
   directPath(listener, emitter) {
     return this.#plan.path(listener, emitter, this.speedOfSound);

@@ -4,6 +4,8 @@
 import { Field } from "./field.js";
 import { spectraOf } from "./renderer.js";
 
+const WARM_UP = 6; // responses before the first that is heard: code that runs for the first time is slow
+
 let field = null;
 let quantum = 0;
 const placed = new Map(); // emitter id -> {listener, emitter, poseId, hasPath}; in the order in which responses are computed
@@ -19,7 +21,10 @@ async function open({ server, scene, level, key, sampleRate, block }) {
     }
     quantum = block;
     const longestS = field.longestM / field.speedOfSound;
-    self.postMessage({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS });
+    const { listener, emitter } = field.start;
+    let ms = 0;
+    for (let i = 0; i < WARM_UP; i++) ms = compute(listener, emitter).ms;
+    self.postMessage({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS, ms });
   } catch ({ code = null, message, status }) {
     self.postMessage({ type: "failed", code, message, needsKey: status === 401 });
   }
@@ -42,6 +47,12 @@ function pathOf({ listener, emitter }) {
   return { delay: (path.lengthM / field.speedOfSound) * field.sampleRate, filter: field.directFilter(path), gains: [1, y, z, x] };
 }
 
+function compute(listener, emitter) {
+  const start = performance.now();
+  const spectra = spectraOf(field.reflections(listener, emitter), quantum, spare.pop());
+  return { spectra, ms: performance.now() - start };
+}
+
 function refuse(id, error) {
   placed.delete(id);
   self.postMessage({ type: "refused", id, message: error.message });
@@ -62,10 +73,7 @@ port1.onmessage = () => {
     const [id, { listener, emitter, poseId }] = next;
     placed.delete(id);
     try {
-      const start = performance.now();
-      const channels = field.reflections(listener, emitter);
-      const ms = performance.now() - start;
-      const spectra = spectraOf(channels, quantum, spare.pop());
+      const { spectra, ms } = compute(listener, emitter);
       self.postMessage({ type: "response", id, poseId, spectra, ms }, [spectra.buffer]);
     } catch (error) {
       refuse(id, error);

@@ -111,7 +111,8 @@ export class LocalStream {
     }
   }
 
-  #opened({ level, ...shape }) {
+  #opened({ level, ms, ...shape }) {
+    this.#costs.push(ms);
     this.#shape = { ...shape, sampleRate: this.#sampleRate };
     const welcome = {
       type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: BLOCK, channels: CHANNELS, encoding: "f32", level,

@@ -14,19 +14,19 @@ export class LocalWorkerStream extends WorkerStream {
     super(worker);
   }
 
-  /** Opens a stream, in place of any before. `url` is the address of a server, of which nothing is asked but files. */
-  open({ url, key, hello, listener, emitters, port }) {
-    this.#server = apiOf(url);
-    this.#key = key;
-    if (hello.sampleRate !== this.#sampleRate) this.#clips.clear();
-    this.#sampleRate = hello.sampleRate;
-    super.open({ server: this.#server.href, key, hello, listener, emitters, port });
-    for (const emitter of emitters) this.#fetch(emitter);
-  }
-
+  /** Gives a command of stream_worker.js. The `url` of "open" is the address of a server, of which nothing is asked but files. */
   tell(type, detail, transfer = []) {
     if (type === "emitter") this.#fetch(detail);
-    super.tell(type, detail, transfer);
+    super.tell(type, type === "open" ? this.#opened(detail) : detail, transfer);
+  }
+
+  #opened({ url, ...stream }) {
+    this.#server = apiOf(url);
+    this.#key = stream.key ?? null;
+    if (stream.hello.sampleRate !== this.#sampleRate) this.#clips.clear();
+    this.#sampleRate = stream.hello.sampleRate;
+    for (const emitter of stream.emitters) this.#fetch(emitter);
+    return { ...stream, server: this.#server.href };
   }
 
   async #fetch({ clip }) {
