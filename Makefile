@@ -32,7 +32,7 @@ MEASURE ?= --half report
 # How long either fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
 # Folders with tests that watch the clock: collecting the others takes as long as many a test.
-TIMED := $(addprefix tests/,api bench integration runtime streaming)
+TIMED := $(addprefix tests/,bench integration runtime streaming)
 # Pages of /docs and /redoc, kept in server/web/vendor.
 SWAGGER_UI := 5.35.0
 REDOC := 2.5.4

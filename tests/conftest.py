@@ -46,7 +46,7 @@ _LONG_FIRST = (
 """Files that take longest, by how their names begin, in this order: what begins last should be short. The first makes
 the bundle for which others of its folder would wait."""
 
-_TIMED = ("api/", "bench/", "integration/", "runtime/", "streaming/")
+_TIMED = ("bench/", "integration/", "runtime/", "streaming/")
 """Folders with `timed` tests: TIMED of the Makefile."""
 
 

@@ -413,7 +413,8 @@ def test_no_stream_opens_on_a_thread_that_is_stuck(pair):
 
 
 @pytest.mark.timed
-def test_on_real_threads_streams_move_to_and_fro_and_end_and_none_loses_a_block(field, filters):
+@pytest.mark.parametrize("seconds", [2.0, pytest.param(6.0, marks=pytest.mark.long)])
+def test_on_real_threads_streams_move_to_and_fro_and_end_and_none_loses_a_block(field, filters, seconds):
     loop = threading.Lock()  # posted calls run one at a time, as on an event loop
     rng = random.Random(7)
 
@@ -444,7 +445,7 @@ def test_on_real_threads_streams_move_to_and_fro_and_end_and_none_loses_a_block(
 
         for _ in range(9):
             opened()
-        until_s = time.monotonic() + 6
+        until_s = time.monotonic() + seconds
         for number in itertools.count():
             if time.monotonic() > until_s:
                 break

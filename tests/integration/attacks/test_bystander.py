@@ -66,7 +66,7 @@ def test_a_server_that_stands_still_is_noticed(address, server_pid):
             os.kill(server_pid, signal.SIGCONT)
         time.sleep(1.0)
 
-    _, harm = bystander.beside_bystander(address, server_pid, stop)
+    _, harm = bystander.beside_bystander(address, server_pid, stop, rest_s=1.0)
     assert not harm.is_none
     assert harm.during.livez_worst_ms > 700
     assert harm.late_beyond_rest > 0.1

@@ -122,7 +122,7 @@ async def ask(port, path):
         writer.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
 def test_twenty_streams_and_five_requests_are_told_and_the_server_ends_in_time(tmp_path, number):
     async def scenario(server):
         hear = [asyncio.Event() for _ in range(20)]
@@ -153,9 +153,10 @@ def test_twenty_streams_and_five_requests_are_told_and_the_server_ends_in_time(t
     assert "Traceback" not in ended.said
 
 
-def test_with_nothing_in_flight_it_ends_at_once_even_in_the_midst_of_its_warm_up(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_with_nothing_in_flight_it_ends_at_once_even_in_the_midst_of_its_warm_up(tmp_path, number):
     with serving(tmp_path, until_ready=False) as server:
-        server.tell(signal.SIGTERM)
+        server.tell(number)
         ended = server.end()
     assert ended.code == 0, ended.said
     assert ended.took_s < DRAIN_S / 2 + _SLACK_S
