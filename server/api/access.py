@@ -49,6 +49,14 @@ class Caller:
     """When the key or token ends, in seconds since 1970."""
     proof: ApiKey | TokenKey | None
     """What admitted the caller, as it was read from its file; None for the server's own processes."""
+    subject: str | None = None
+    """Of a token, whole: what tells its bearers apart. None for a key."""
+
+    @property
+    def identity(self) -> str:
+        """The same for one key, and for all tokens of one subject, and for nobody else. It shows neither."""
+        told = self.name if self.subject is None else f"subject {self.subject}"
+        return hashlib.sha256(told.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -133,11 +141,12 @@ class Access:
             scopes=frozenset(scope for scope in SCOPES if scope in claims.scopes),
             expires_s=claims.expires_s + self._tokens.leeway_s,
             proof=claims.key,
+            subject=claims.subject,
         )
 
     def _admit_key(self, key: str) -> Caller:
         if self._own is not None and hmac.compare_digest(digest(key), self._own):
-            return Caller("own process", frozenset({"admin"}), None, None)
+            return Caller("own process", frozenset({"metrics"}), None, None)
         entry = self._keys.find(key)
         if entry is None:
             raise AccessError("key_refused", "there is no such key: it may have been revoked")

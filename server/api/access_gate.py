@@ -2,7 +2,7 @@
 
 It refuses by default: a path that is not listed here needs the scope `admin`, so that a new route is closed until
 somebody decides who may use it. Open to all are the health checks and the files of the page, which are the same on
-every server.
+every server: those of /docs and /redoc too, which fetch the description of the interface with the key of their tab.
 
 A key comes in `Authorization: Bearer KEY`. A browser's `WebSocket` cannot set headers, so there it may come among the
 subprotocols, as `nafir.key.` and the key in base64url. It is never taken from the query, which servers and proxies log.
@@ -53,7 +53,8 @@ RULES: Final = (
     _rule(r"/v1/clips(/.*)?", "upload"),
     _rule(r"/v1/(encodings|hrtfs)(/.*)?", "listen", "render", methods=_READ),
     _rule(r"/v1/stream(/.*)?", "listen"),
-    _rule(r"/(openapi|asyncapi)\.json|/docs(/.*)?|/redoc(/.*)?|/v1/schemas(/.*)?", *SCOPES, methods=_READ),
+    _rule(r"/(openapi|asyncapi)\.json|/v1/schemas(/.*)?", "listen", "render", "upload", "admin", methods=_READ),
+    _rule(r"/metrics(/process)?", "metrics", "admin", methods=_READ),
 )
 """The first rule that matches decides; where none does, the scope is `admin`."""
 
@@ -67,9 +68,10 @@ def scopes_for(method: str, path: str) -> frozenset[api_keys.Scope]:
 
 
 def page_paths(folder: Path) -> frozenset[str]:
-    """Paths of the files of a page, compressed ones by their own names, and `/`."""
-    files = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-    return frozenset({"/", *(f"/{name.removesuffix('.gz')}" for name in files)})
+    """Paths of the files of a page: compressed ones by their own names, pages also without `.html`, and `/`."""
+    files = [file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()]
+    pages = (name.removesuffix(".html") for name in files if name.endswith(".html"))
+    return frozenset({"/", *(f"/{name.removesuffix('.gz')}" for name in files), *(f"/{name}" for name in pages)})
 
 
 def caller_of(scope: Scope) -> Caller | None:

@@ -21,7 +21,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 
 from server.core.errors import NafirError
 
-Scope = Literal["listen", "render", "upload", "admin"]
+Scope = Literal["listen", "render", "upload", "metrics", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 PREFIX = "nafir_"
 _ID_BYTES, _SECRET_BYTES = 6, 32

@@ -28,7 +28,7 @@ from server.api.page_files import PageFiles
 from server.api.problems import install_problems
 from server.api.process_peers import ProcessPeers
 from server.api.rate_limits import RateGate, RateLimits, address_of, key_of
-from server.api.request_log import RequestLog
+from server.api.request_log import RefusedRequests, RequestLog
 from server.api.response_cache import ResponseCache
 from server.api.routes import api, documents, health
 from server.api.settings import Settings, usable_cores
@@ -103,6 +103,7 @@ def create_app(
     drain = Drain(settings.drain_s) if drain is None else drain
     end_traces = None if settings.traces_url is None else begin_traces(settings.traces_url)
     access = Access.of(settings, own_key=None if peers is None else peers.key)
+    refused = RefusedRequests()
     if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
         _logger.warning(_OPEN_TO_ALL, settings.host)
 
@@ -147,6 +148,7 @@ def create_app(
                 uploads=_uploads(settings),
                 peers=peers,
                 access=access,
+                refused_requests=refused,
             )
             if settings.realtime:
                 become_prompt()
@@ -192,7 +194,7 @@ def create_app(
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
     app.add_middleware(RateGate, limits=rate_limits, actor=address_of)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outside the others: gives refusals CORS headers
-    app.add_middleware(RequestLog)
+    app.add_middleware(RequestLog, refused=refused)
     if settings.page:
         app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app

@@ -41,6 +41,7 @@ from server.api.inflow import Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
 from server.api.process_peers import ProcessPeers
+from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
 from server.api.settings import Settings, usable_cores
 from server.api.stream_counts import StreamLedger
@@ -249,6 +250,8 @@ class StreamHost:
     """Costs of rendering by scene and sample rate, and quality level, once they are measured."""
     refused_bundles: int = 0
     """Bundles of the folder that is watched which cannot be loaded."""
+    refused_requests: RefusedRequests = dataclasses.field(default_factory=RefusedRequests)
+    """Counts of requests that were refused because of who asked."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
     admission: Admission = dataclasses.field(init=False)
@@ -393,6 +396,9 @@ class Connection:
         self._goodbye: Goodbye | None = None
         """Why the connection is to end."""
         self._is_ending = asyncio.Event()
+        self._caller = caller_of(websocket.scope)
+        self._owner = None if self._caller is None else self._caller.identity
+        """Who may resume the stream."""
         self._left_with: int | None = None
         """The close code with which the client left, once it is known."""
         self._stream: Stream | None = None
@@ -537,11 +543,11 @@ class Connection:
         unsupported_protocol."""
         require_protocol(asked)
         host = self._host
-        kept = None if asked.token is None else await host.kept.take(asked.token)
+        kept = None if asked.token is None else await host.kept.take(asked.token, owner=self._owner)
         if kept is not None:
             host.kept.outcomes["resumed"] += 1
         elif asked.snapshot is not None and host.seal is not None:
-            data, plays_at = host.seal.open(asked.snapshot, now=host.wall_s())
+            data, plays_at = host.seal.open(asked.snapshot, now=host.wall_s(), owner=self._owner or "")
             kept = KeptStream(data, self._time_s() + plays_at - host.wall_s())
             host.kept.outcomes["resumed_from_snapshot"] += 1
         else:
@@ -616,7 +622,7 @@ class Connection:
         self._session = uuid.uuid4().hex if lost is None else lost.snapshot.session
         if self._host.kept.keep_s:
             former = lost.asked.token if lost is not None and lost.kept.tokens else None
-            self._token = self._host.kept.open(partial(self._end, _TAKEN_OVER), former=former)
+            self._token = self._host.kept.open(partial(self._end, _TAKEN_OVER), owner=self._owner, former=former)
         await self._send_message(
             Welcome(
                 session=self._session,
@@ -733,9 +739,9 @@ class Connection:
         self._host.audio.open(stream)
         reading = asyncio.create_task(self._read_incoming(stream, hello))
         tasks = [reading, asyncio.create_task(self._send_outgoing()), asyncio.create_task(self._watch(stream))]
-        access, caller = self._host.access, caller_of(self._websocket.scope)
-        if access is not None and caller is not None:
-            tasks.append(asyncio.create_task(_end_of_access(access, caller)))
+        access = self._host.access
+        if access is not None and self._caller is not None:
+            tasks.append(asyncio.create_task(_end_of_access(access, self._caller)))
         if hello.snapshots and self._host.seal is not None:
             tasks.append(asyncio.create_task(self._send_snapshots(stream)))
         try:
@@ -801,7 +807,8 @@ class Connection:
             return None
         now = host.wall_s()
         data = state.snapshot.model_dump_json().encode()
-        sealed = host.seal.close(data, plays_at=now + state.plays_s - self._time_s(), now=now)
+        plays_at = now + state.plays_s - self._time_s()
+        sealed = host.seal.close(data, plays_at=plays_at, now=now, owner=self._owner or "")
         if sealed is None:
             return None
         return SnapshotTaken(

@@ -6,6 +6,8 @@ server may be held. So it costs nothing to keep some, and what resumes is a new 
 A token is replaced at every resume. The former one is good until the client has sent something: a client whose
 connection broke before the `welcome` arrived knows no other.
 
+A stream belongs to whoever opened it. To another caller its token is as unknown as any, and takes nothing over.
+
 `KeptStreams` belongs to the event loop.
 """
 
@@ -35,6 +37,7 @@ class KeptStream:
     plays_s: float
     place: Place | None = None
     tokens: tuple[str, ...] = field(default=(), init=False)
+    owner: str | None = field(default=None, init=False)
     until_s: float = field(default=0.0, init=False)
     expiry: asyncio.TimerHandle | None = field(default=None, init=False)
 
@@ -44,6 +47,7 @@ class _OpenStream:
     """A stream that has a connection, which `take_over` ends."""
 
     tokens: tuple[str, ...]
+    owner: str | None
     take_over: Callable[[], None]
     has_ended: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -73,11 +77,11 @@ class KeptStreams:
         """Whether a place is held for a stream that may come back."""
         return any(kept.place is not None for kept in self._order)
 
-    def open(self, take_over: Callable[[], None], *, former: str | None = None) -> str:
+    def open(self, take_over: Callable[[], None], *, owner: str | None = None, former: str | None = None) -> str:
         """Return the token of a stream that begins, or goes on after it was found by a `former` token. `take_over` has
-        to end its connection."""
+        to end its connection. `owner` is the one who may resume it; None where callers are not told apart."""
         token = secrets.token_urlsafe(_TOKEN_BYTES)
-        stream = _OpenStream((token,) if former is None else (token, former), take_over)
+        stream = _OpenStream((token,) if former is None else (token, former), owner, take_over)
         self._open.update(dict.fromkeys(stream.tokens, stream))
         return token
 
@@ -98,16 +102,17 @@ class KeptStreams:
         for each in stream.tokens:
             del self._open[each]
         if kept is not None:
-            kept.tokens, kept.until_s = stream.tokens, asyncio.get_running_loop().time() + self.keep_s
+            kept.tokens, kept.owner = stream.tokens, stream.owner
+            kept.until_s = asyncio.get_running_loop().time() + self.keep_s
             self.outcomes["kept"] += 1
             self.put_back(kept)
         stream.has_ended.set()
 
-    async def take(self, token: str) -> KeptStream | None:
-        """Return the stream of a token, which is not kept any more then; None if there is none. If the stream has a
-        connection, it is taken over."""
+    async def take(self, token: str, *, owner: str | None = None) -> KeptStream | None:
+        """Return the stream of a token, which is not kept any more then; None if there is none, or if it is not the
+        `owner`'s. If the stream has a connection, it is taken over."""
         stream = self._open.get(token)
-        if stream is not None:
+        if stream is not None and stream.owner == owner:
             stream.take_over()
             try:
                 async with asyncio.timeout(_PATIENCE_S):
@@ -115,8 +120,9 @@ class KeptStreams:
             except TimeoutError:
                 pass
         kept = self._kept.get(token)
-        if kept is not None:
-            self._remove(kept)
+        if kept is None or kept.owner != owner:
+            return None
+        self._remove(kept)
         return kept
 
     def put_back(self, kept: KeptStream) -> None:

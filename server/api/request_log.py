@@ -1,4 +1,5 @@
-"""A line in the log for each request and each refused handshake, and an id by which it is found again.
+"""A line in the log for each request and each refused handshake, an id by which it is found again, and counts of those
+that were refused.
 
 The id is that of the request's `X-Request-ID` if it is a plain word, and random otherwise. The answer has it, and so
 has every line that is written on the way, that of a stream included.
@@ -9,12 +10,14 @@ import logging
 import re
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.problem_codes import PROBLEM_CODES
 from server.runtime.logs import begin_about
 from server.runtime.traces import span
 
@@ -23,6 +26,9 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _QUIET: Final = frozenset({"/livez", "/readyz", "/metrics", "/metrics/process"})
 """Paths that are asked for every few seconds: only what goes wrong with them is written."""
 _CLIENT_CLOSED_REQUEST = 499
+_REFUSED: Final = ("401", "403", "429")
+"""Statuses of refusals that are counted: those that depend on who asks, and not on what is asked."""
+_OTHER: Final = "other"
 
 _logger = logging.getLogger(__name__)
 
@@ -33,11 +39,31 @@ def request_id(headers: Headers) -> str:
     return given[0] if len(given) == 1 and _PLAIN.fullmatch(given[0]) else uuid.uuid4().hex
 
 
+class RefusedRequests:
+    """How many requests and handshakes were refused because of who asked, by status and code. There is a count for each
+    code of such a status from the start, and one for all others, so clients cannot make new ones."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[tuple[str, str]] = Counter()
+        for status in _REFUSED:
+            codes = (code for code, meaning in PROBLEM_CODES.items() if meaning.startswith(status))
+            self.counts.update(dict.fromkeys(((status, code) for code in (*codes, _OTHER)), 0))
+
+    def note(self, status: int, code: str | None) -> None:
+        """Count an answer, if it is such a refusal."""
+        if str(status) in _REFUSED:
+            told = (str(status), code or _OTHER)
+            self.counts[told if told in self.counts else (str(status), _OTHER)] += 1
+
+
 class RequestLog:
     """ASGI middleware, the outermost."""
 
-    def __init__(self, app: ASGIApp, *, time_s: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, app: ASGIApp, *, refused: RefusedRequests, time_s: Callable[[], float] = time.perf_counter
+    ) -> None:
         self._app = app
+        self._refused = refused
         self._time_s = time_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -84,6 +110,8 @@ class RequestLog:
             status, code = status or 500, code or "internal_error"
             raise
         finally:
+            if status is not None:
+                self._refused.note(status, code)
             if status != 101 and not (scope["path"] in _QUIET and status == 200):
                 _logger.info(
                     "request",

@@ -16,6 +16,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from server.api.kept_streams import KeptStreams
+from server.api.request_log import RefusedRequests
 from server.api.stream_counts import StreamLedger, StreamTotals
 from server.assets.clips import ClipLibrary
 from server.core.durations import DurationHistogram
@@ -48,6 +49,9 @@ class Host(Protocol):
 
     @property
     def refused_bundles(self) -> int: ...
+
+    @property
+    def refused_requests(self) -> RefusedRequests: ...
 
     @property
     def ledger(self) -> StreamLedger: ...
@@ -99,6 +103,7 @@ class ServerCollector(Collector):
         yield from self._audio_threads()
         yield self._level_costs()
         yield from _admission(self._host.admission)
+        yield _refused(self._host.refused_requests)
         yield from _kept(self._host.kept)
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
@@ -230,6 +235,18 @@ def _admission(admission: Admission) -> Iterator[Metric]:
     for (asked, scarce), count in admission.refusals.items():
         refusals.add_metric([asked, scarce], count)
     yield refusals
+
+
+def _refused(refused: RefusedRequests) -> Metric:
+    counted = CounterMetricFamily(
+        "nafir_requests_refused",
+        "Requests and openings of streams that were refused because of who asked: without a valid key (401), without "
+        "the right to it (403), or too often (429). The reason is the code of the answer.",
+        labels=["status", "reason"],
+    )
+    for (status, reason), count in tuple(refused.counts.items()):
+        counted.add_metric([status, reason], count)
+    return counted
 
 
 def _kept(streams: KeptStreams) -> Iterator[Metric]:

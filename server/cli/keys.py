@@ -24,7 +24,9 @@ def create(
     file: KeysFile,
     scope: Annotated[
         list[str],
-        typer.Option(help="What the key may do: listen, render, upload or admin; repeatable.", metavar="SCOPE"),
+        typer.Option(
+            help="What the key may do: listen, render, upload, metrics or admin; repeatable.", metavar="SCOPE"
+        ),
     ],
     name: Annotated[str, typer.Option(help="Whose key it is.")] = "",
     days: Annotated[float | None, typer.Option(help="Days until the key expires. [default: never]")] = None,

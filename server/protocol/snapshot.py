@@ -25,8 +25,8 @@ from server.protocol.message import Message
 
 MOST_SEALED: Final = 48 * 1024
 """Longest sealed snapshot, which fits into a message."""
-_SIGNED_FOR: Final = b"nafir snapshot 1:"
-"""Keeps signatures apart from any others by the same secret."""
+_SIGNED_FOR: Final = b"nafir snapshot 2:"
+"""Keeps signatures apart from any others by the same secret, and of another form."""
 _TIMES: Final = struct.Struct("<dd")
 _SIGNATURE_BYTES: Final = hashlib.sha256().digest_size
 MOST_BYTES = 512 * 1024
@@ -69,36 +69,37 @@ class Snapshot(Message):
 
 @dataclass(frozen=True)
 class Seal:
-    """Signs snapshots by HMAC-SHA256 with a `secret`. They are good for `lifetime_s`."""
+    """Signs snapshots by HMAC-SHA256 with a `secret`. They are good for `lifetime_s`, and for the `owner` alone that
+    they were closed for: text without a colon, empty where callers are not told apart."""
 
     secret: bytes
     lifetime_s: float
 
-    def close(self, data: bytes, *, plays_at: float, now: float) -> str | None:
+    def close(self, data: bytes, *, plays_at: float, now: float, owner: str = "") -> str | None:
         """Seal a snapshot as JSON whose next block plays at `plays_at`; None if it is too long. Times are seconds since
         1970."""
         payload = _TIMES.pack(plays_at, now + self.lifetime_s) + zlib.compress(data)
-        sealed = base64.urlsafe_b64encode(self._sign(payload) + payload).decode()
+        sealed = base64.urlsafe_b64encode(self._sign(payload, owner) + payload).decode()
         return sealed if len(sealed) <= MOST_SEALED else None
 
-    def open(self, sealed: str, *, now: float) -> tuple[bytes, float]:
+    def open(self, sealed: str, *, now: float, owner: str = "") -> tuple[bytes, float]:
         """Return the snapshot as JSON, and when its next block would have played. Raises RequestError
-        unknown_resume_token for one that this secret has not signed, or whose time is over."""
+        unknown_resume_token for one that this secret has not signed for this owner, or whose time is over."""
         try:
             signed = base64.b64decode(sealed, altchars=b"-_", validate=True)
         except (binascii.Error, ValueError):
             signed = b""
         signature, payload = signed[:_SIGNATURE_BYTES], signed[_SIGNATURE_BYTES:]
         # guard: nothing of a snapshot is read before its signature is checked
-        if not hmac.compare_digest(signature, self._sign(payload)):
+        if not hmac.compare_digest(signature, self._sign(payload, owner)):
             raise _unusable("the snapshot is not one of this server's, or was changed")
         plays_at, until = _TIMES.unpack_from(payload)
         if now > until:
             raise _unusable(f"the snapshot is older than {self.lifetime_s:g} s")
         return zlib.decompress(payload[_TIMES.size :]), plays_at
 
-    def _sign(self, payload: bytes) -> bytes:
-        return hmac.digest(self.secret, _SIGNED_FOR + payload, "sha256")
+    def _sign(self, payload: bytes, owner: str) -> bytes:
+        return hmac.digest(self.secret, _SIGNED_FOR + owner.encode() + b":" + payload, "sha256")
 
 
 def _unusable(problem: str) -> RequestError:

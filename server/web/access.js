@@ -1,10 +1,35 @@
-// The key that the server may ask for. It is kept for this tab alone (sessionStorage) and leaves it in headers only.
+// The key that the server may ask for. It is kept for this tab alone (sessionStorage) and leaves it in headers only. All pages
+// ask by the same dialog, which is made when the first needs it.
+
+import { fetchJson } from "./nafir/http.js";
 
 const KEPT_AS = "nafir.key";
+const NEEDS_KEY = 401;
+const DIALOG = `
+  <form id="key-form">
+    <h2 id="key-title">This server asks for a key</h2>
+    <p id="key-reason" class="quiet" role="alert"></p>
+    <label for="key-field">Key or token</label>
+    <input id="key-field" type="password" autocomplete="off" spellcheck="false" required />
+    <p class="quiet">It is kept until you close this tab.</p>
+    <button class="add" type="submit">Use this key</button>
+  </form>`;
 
 let asking = null; // the promise of an answer, while the dialog is open
 
 export const key = () => sessionStorage.getItem(KEPT_AS);
+
+/** What the server says at `url`, asked with the key; with another if it refuses this one. */
+export async function getJson(url, options) {
+  const given = key();
+  try {
+    return await fetchJson(url, { ...options, key: given });
+  } catch (error) {
+    if (error.status !== NEEDS_KEY) throw error;
+    await askForKey(error.message, given);
+    return getJson(url, options);
+  }
+}
 
 /** Asks for another key than the one that was `refused`. Resolves when there is one; all who ask meanwhile share one dialog. */
 export function askForKey(reason, refused = key()) {
@@ -14,7 +39,7 @@ export function askForKey(reason, refused = key()) {
 }
 
 function ask(reason) {
-  const dialog = document.getElementById("key");
+  const dialog = document.getElementById("key") ?? makeDialog();
   const field = document.getElementById("key-field");
   document.getElementById("key-reason").textContent = reason;
   field.value = "";
@@ -33,4 +58,15 @@ function ask(reason) {
     };
     dialog.showModal();
   });
+}
+
+function makeDialog() {
+  const dialog = document.createElement("dialog");
+  dialog.id = "key";
+  dialog.className = "asks";
+  dialog.setAttribute("aria-labelledby", "key-title");
+  dialog.setAttribute("aria-describedby", "key-reason");
+  dialog.innerHTML = DIALOG;
+  document.body.append(dialog);
+  return dialog;
 }

@@ -1,2 +1,4 @@
 /* global Redoc */
-Redoc.init("openapi.json", {}, document.getElementById("interface"));
+import { description } from "./interface.js";
+
+Redoc.init(await description(), {}, document.getElementById("interface"));

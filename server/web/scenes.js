@@ -1,23 +1,11 @@
 // Requests to the server over HTTP: scenes, clips, heads and loudness maps. A server that asks for a key gets the one
 // that the user gives.
 
-import { askForKey, key } from "./access.js";
-import { decoderUrl, fetchJson } from "./nafir/http.js";
+import { getJson } from "./access.js";
+import { decoderUrl } from "./nafir/http.js";
 
 const BASE = new URL("v1/", document.baseURI);
 const endpoint = (path) => new URL(path, BASE);
-const NEEDS_KEY = 401;
-
-async function getJson(url, options) {
-  const given = key();
-  try {
-    return await fetchJson(url, { ...options, key: given });
-  } catch (error) {
-    if (error.status !== NEEDS_KEY) throw error;
-    await askForKey(error.message, given);
-    return getJson(url, options);
-  }
-}
 
 export const fetchScenes = () => getJson(endpoint("scenes"));
 export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}`));

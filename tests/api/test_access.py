@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 import json
 import os
 import time
@@ -20,7 +21,7 @@ from server.api.process_peers import OWN_METRICS, ProcessPeers
 from server.api.settings import Settings, settings_of
 from server.core.errors import NafirError
 from server.field.fields_by_level import FieldsByLevel
-from server.protocol.client_messages import PROTOCOL, Hello
+from server.protocol.client_messages import PROTOCOL, Hello, Resume
 from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES
 from server.protocol.server_messages import Error, Welcome, parse_server_message
 from tests.api.token_keys import AUDIENCE, KEY_SET, token
@@ -107,8 +108,8 @@ def test_an_outsider_gets_nothing_but_health_and_the_page(client):
             tried.add(path)
     assert {"/v1/stream", "/v1/scenes", "/metrics", OWN_METRICS, "/openapi.json", "/asyncapi.json"} <= tried
     for path in (
-        "/docs",
-        "/redoc",
+        "/docs/",
+        "/docs.js.map",
         "/v2",
         "/nothing",
         "/livez/",
@@ -123,7 +124,8 @@ def test_an_outsider_gets_nothing_but_health_and_the_page(client):
     for file in WEB.rglob("*"):
         if file.is_file():
             assert client.get(f"/{file.relative_to(WEB).as_posix().removesuffix('.gz')}").status_code == 200
-    assert client.get("/").status_code == 200
+    for path in ("/", "/docs", "/redoc"):
+        assert client.get(path).status_code == 200
 
 
 def test_no_route_of_version_1_is_closed_to_all_but_operators_by_oversight(client):
@@ -155,9 +157,10 @@ def test_a_key_in_the_query_opens_nothing(client, keys):
         ("DELETE", "/v1/clips/abc", {"upload"}),
         ("GET", "/v1/hrtfs/kemar/decoder", {"listen", "render"}),
         ("GET", "/v1/stream", {"listen"}),
-        ("GET", "/openapi.json", set(SCOPES)),
-        ("GET", "/metrics", {"admin"}),
-        ("GET", OWN_METRICS, {"admin"}),
+        ("GET", "/openapi.json", {"listen", "render", "upload", "admin"}),
+        ("GET", "/metrics", {"metrics", "admin"}),
+        ("GET", OWN_METRICS, {"metrics", "admin"}),
+        ("POST", "/metrics", {"admin"}),
         ("GET", "/anything/new", {"admin"}),
         ("POST", "/v1/scenes", {"admin"}),
         ("DELETE", "/v1/scenes/flat", {"admin"}),
@@ -316,6 +319,32 @@ def test_a_stream_ends_when_the_key_of_its_token_leaves_the_set(client, folder):
     assert client.get("/v1/scenes", headers=bearer(token("RS256"))).status_code == 200
     file.write_text(json.dumps(KEY_SET))
     wait_until(lambda: client.get("/v1/scenes", headers=bearer(token("ES256"))).status_code == 200)
+
+
+def test_a_stream_is_resumed_by_whoever_opened_it_and_nobody_else(client, keys, folder):
+    """Keys and subjects are told apart also where their scopes are the same."""
+
+    def begin(key, first):
+        """A stream, and what the server says first."""
+        socket = streams.enter_context(client.websocket_connect("/v1/stream", headers=bearer(key)))
+        socket.send_text(first.serialize())
+        return socket, parse_server_message(socket.receive_text())
+
+    other, _ = create_key(folder / "keys.json", "other", ["listen"], None)
+    wait_until(lambda: client.get("/v1/scenes", headers=bearer(other)).status_code == 200)
+    player, later, another = token(sub="player"), token(sub="player", exp=int(time.time()) + 90), token(sub="another")
+    cases = ((keys["listen"], keys["listen"], (other, player)), (player, later, (another, other)))
+    for owner, again, strangers in cases:
+        with contextlib.ExitStack() as streams:
+            first, welcome = begin(owner, HELLO)
+            resume = Resume(protocol=PROTOCOL, token=welcome.resume_token)
+            for stranger in strangers:
+                assert begin(stranger, resume)[1].code == "unknown_resume_token"
+            first.send_text('{"type": "ping", "id": 7}')  # nothing was taken over
+            while '"pong"' not in (first.receive().get("text") or ""):
+                pass
+            assert isinstance(begin(again, resume)[1], Welcome)
+            assert closed_with(first)[0] == "taken_over"
 
 
 def wait_until(holds):

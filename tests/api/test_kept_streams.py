@@ -40,6 +40,24 @@ def test_a_stream_that_ended_with_a_goodbye_is_not_found():
     assert running(scenario) == (None, 0)
 
 
+def test_a_stream_is_found_by_its_owner_alone():
+    async def scenario():
+        streams, _ = keeping(keep_s=5.0)
+        taken_over = []
+        token = streams.open(lambda: taken_over.append(1), owner="a")
+        assert await streams.take(token, owner="b") is None
+        assert await streams.take(token) is None
+        assert taken_over == []
+        streams.close(token, KeptStream(b"state", 1.0))
+        assert await streams.take(token, owner="b") is None
+        assert await streams.take(token) is None
+        return (await streams.take(token, owner="a")).data, streams.open(lambda: None)
+
+    data, of_nobody = running(scenario)
+    assert data == b"state"
+    assert of_nobody
+
+
 def test_nobody_guesses_a_token():
     streams, _ = keeping()
     tokens = {streams.open(lambda: None) for _ in range(100)}

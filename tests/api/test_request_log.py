@@ -8,11 +8,16 @@ from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from server.api import request_log
 from server.api.problems import problem
-from server.api.request_log import REQUEST_ID, RequestLog
+from server.api.request_log import REQUEST_ID, RefusedRequests, RequestLog
 
 
 @pytest.fixture
-def client():
+def counted():
+    return RefusedRequests()
+
+
+@pytest.fixture
+def client(counted):
     async def good(_):
         return PlainTextResponse("heard")
 
@@ -43,7 +48,7 @@ def client():
         Route("/v1/bare", bare),
         WebSocketRoute("/v1/stream", stream),
     ]
-    return TestClient(RequestLog(Starlette(routes=routes)), raise_server_exceptions=False)
+    return TestClient(RequestLog(Starlette(routes=routes), refused=counted), raise_server_exceptions=False)
 
 
 @pytest.fixture
@@ -97,6 +102,16 @@ def test_a_refused_handshake_has_a_line(client, logged):
     assert headers[b"x-own"] == b"1"
     assert len(headers[REQUEST_ID.lower().encode()]) == 32
     assert logged() == []  # the stream's own lines say what became of it
+
+
+def test_who_is_refused_is_counted_once(client, counted):
+    client.get("/v1/good")
+    client.get("/v1/refused")
+    for query in ("?deny", "?close"):
+        with pytest.raises((WebSocketDenialResponse, Exception)), client.websocket_connect(f"/v1/stream{query}"):
+            pass
+    told = {refusal: count for refusal, count in counted.counts.items() if count}
+    assert told == {("401", "key_required"): 1, ("403", "origin_not_allowed"): 1}
 
 
 def test_an_id_is_taken_over_if_it_is_a_plain_word(client):

@@ -5,6 +5,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from server.api.kept_streams import KeptStreams
+from server.api.request_log import RefusedRequests
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector, exposition
 from server.core.durations import DurationHistogram
@@ -32,6 +33,7 @@ class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
         self.refused_bundles = 0
+        self.refused_requests = RefusedRequests()
         self.ledger = StreamLedger()
         self.admission = Admission(audio, most_streams=1, cores=2)
         self.kept = KeptStreams(keep_s=1.0, most=1, give_up=self.admission.leave)
@@ -165,3 +167,16 @@ def test_headroom_and_refusals_by_reason_are_told(host, field, filters):
     host.admission.measure()
     assert samples(host)["nafir_headroom",] == 0.0
     assert samples(host)["nafir_refusals_total", ("asked", "upgrade"), ("reason", "streams")] == 1
+
+
+def test_refused_callers_are_counted_by_code_and_nothing_else_makes_a_label(host):
+    before = samples(host)
+    refused = {key: value for key, value in before.items() if key[0] == "nafir_requests_refused_total"}
+    assert ("nafir_requests_refused_total", ("reason", "scope_missing"), ("status", "403")) in refused
+    assert set(refused.values()) == {0}
+    for status, code in ((401, "key_refused"), (401, "made up"), (429, None), (404, "not_found"), (200, None)):
+        host.refused_requests.note(status, code)
+    told = samples(host)
+    assert told.keys() == before.keys()
+    counted = {dict(key[1:])["status"] + dict(key[1:])["reason"]: told[key] for key in refused if told[key]}
+    assert counted == {"401key_refused": 1, "401other": 1, "429other": 1}

@@ -13,6 +13,7 @@ import typer
 from server.api.app import create_app
 from server.api.kept_streams import KeptStreams
 from server.api.problem_codes import PROBLEM_CODES
+from server.api.request_log import RefusedRequests
 from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector
@@ -143,6 +144,7 @@ class Host:
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}
         self.refused_bundles = 0
+        self.refused_requests = RefusedRequests()
 
 
 def test_every_metric_is_listed(page: Page) -> None:

@@ -4,8 +4,9 @@ import urllib.parse
 
 import pytest
 
+from server.api.api_keys import create_key
 from tests import visitor
-from tests.visitor import browser
+from tests.visitor import browser, free_port, serving
 
 pytestmark = visitor.needs_browser
 __all__ = ["browser"]
@@ -25,3 +26,28 @@ def test_the_interface_is_shown_without_a_foreign_host(browser, server, path, sh
     context.close()
     assert asked <= {urllib.parse.urlsplit(server).netloc, ""}
     assert [each for each in complaints if "cdn.redoc.ly" not in each] == []
+
+
+def test_a_server_with_keys_shows_it_once_it_has_one_and_tries_out_with_it(browser, tmp_path):
+    key, _ = create_key(tmp_path / "keys.json", "", ["listen"], None)
+    context = browser.new_context()
+    page = context.new_page()
+    asked = []
+    page.on("request", lambda request: asked.append((request.url, request.headers.get("authorization"))))
+    with serving(free_port(), settings={"NAFIR_KEYS_FILE": str(tmp_path / "keys.json")}) as url:
+        page.goto(f"{url}/docs")
+        page.wait_for_selector("#key[open]")
+        assert page.locator(".opblock").count() == 0
+        page.fill("#key-field", key)
+        page.keyboard.press("Enter")
+        page.wait_for_selector(".opblock")
+        page.locator("#operations-v1-get_scenes_v1_scenes_get, [id*='scenes_v1_scenes_get']").first.click()
+        page.get_by_role("button", name="Try it out").first.click()
+        with page.expect_response(f"{url}/v1/scenes") as answer:
+            page.get_by_role("button", name="Execute").click()
+        assert answer.value.status == 200
+        page.goto(f"{url}/redoc")
+        page.wait_for_selector("#interface h1")
+    context.close()
+    assert (f"{url}/v1/scenes", f"Bearer {key}") in asked
+    assert not [each for each, _ in asked if "nafir_" in each]

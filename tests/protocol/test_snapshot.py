@@ -45,6 +45,14 @@ def test_another_secret_and_what_is_none_are_refused():
         refused(SEAL, sealed)
 
 
+def test_it_is_good_for_the_owner_alone_that_it_was_closed_for():
+    sealed = SEAL.close(DATA, plays_at=1_000.0, now=1_000.0, owner="abc")
+    assert SEAL.open(sealed, now=1_000.0, owner="abc") == (DATA, 1_000.0)
+    for other in ("", "ab", "abcd"):
+        with pytest.raises(RequestError, match="not one of this server's"):
+            SEAL.open(sealed, now=1_000.0, owner=other)
+
+
 def test_one_too_long_for_a_message_is_not_made():
     long = bytes(byte * 31 % 251 ^ byte >> 8 & 255 for byte in range(3 * MOST_SEALED))
     noise = b"".join(hashlib.sha256(bytes([n % 256, n // 256])).digest() for n in range(2_000))
