@@ -3,7 +3,7 @@
 import asyncio
 import dataclasses
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from functools import partial
@@ -35,6 +35,7 @@ from server.api.settings import Settings, usable_cores
 from server.api.strict_requests import StrictRequests
 from server.api.uploads import Uploads
 from server.assets.clip_store import ClipStore
+from server.assets.clips import Clip
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.assets.upload_decoder import DecodingLimits
 from server.core.entity_tags import fingerprint
@@ -215,7 +216,7 @@ def _turn_away(scope: Scope) -> Response | None:
 async def _become_ready(host: StreamHost, compiler: CompilingProcess, folder: BundleFolder | None) -> None:
     progress = asyncio.create_task(tell_while_compiling())
     try:
-        await run_in_own_thread(partial(_warm_up, host, compiler), "nafir-warm-up")
+        await run_in_own_thread(partial(_warm_up, host, compiler, folder), "nafir-warm-up")
     except Exception:  # the server stays up but not ready, so that an operator can look at it
         _logger.exception("warm-up failed")
         host.readiness.warm_up = "failed"
@@ -225,14 +226,17 @@ async def _become_ready(host: StreamHost, compiler: CompilingProcess, folder: Bu
     collect_rarely()
     host.readiness.warm_up = "done"
     _logger.info("ready: %s", ", ".join(host.scenes))
+    has_changed = asyncio.Event()
+    has_changed.set()
     async with asyncio.TaskGroup() as group:
-        group.create_task(_prepare_the_rest(host))
+        group.create_task(_keep_prepared(host, has_changed))
         if folder is not None:
-            group.create_task(_follow(host, folder))
+            host.refused_bundles = folder.refused
+            group.create_task(_follow(host, folder, has_changed))
 
 
-async def _follow(host: StreamHost, folder: BundleFolder) -> None:
-    """Offer what the folder of bundles has, as it changes."""
+async def _follow(host: StreamHost, folder: BundleFolder, has_changed: asyncio.Event) -> None:
+    """Offer what the folder of bundles has, as it changes, and say that it `has_changed`."""
     while True:
         await asyncio.sleep(host.settings.bundle_folder_s)
         try:
@@ -253,7 +257,16 @@ async def _follow(host: StreamHost, folder: BundleFolder) -> None:
                 _logger.info("loaded: %s, from %s", scene, levels.bundle.folder)
         host.refused_bundles = folder.refused
         if changes:
-            await _prepare_the_rest(host)
+            has_changed.set()
+
+
+async def _keep_prepared(host: StreamHost, has_changed: asyncio.Event) -> None:
+    """Prepare the rest at the start and whenever scenes have changed since it was last begun, one time after the
+    other."""
+    while True:
+        await has_changed.wait()
+        has_changed.clear()
+        await _prepare_the_rest(host)
 
 
 async def _prepare_the_rest(host: StreamHost) -> None:
@@ -303,9 +316,10 @@ def _measure_effects(host: StreamHost, duty_cycle: DutyCycle) -> None:
             return
 
 
-def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
+def _warm_up(host: StreamHost, compiler: CompilingProcess, folder: BundleFolder | None) -> None:
     """Decode clips, compute responses and render once, so that the first stream does not have to wait for it. Also
-    measure how long this host takes for a response of each level."""
+    measure how long this host takes for a response of each level. A scene of the `folder` that fails is left out, as
+    one that comes later would be."""
     compiler.begin((levels.bundle for levels in host.scenes.values()), cores=usable_cores())
     with ThreadPoolExecutor(1, "nafir-clips") as decoding:
         playable = decoding.map(playable_clips, host.clips.values())
@@ -314,12 +328,26 @@ def _warm_up(host: StreamHost, compiler: CompilingProcess) -> None:
         warm_up(get_args(BlockSize))
         clips_of = dict(zip(host.clips, playable, strict=True))  # before times are measured
     for scene, levels in tuple(host.scenes.items()):
-        _offer(host, _measured(host, levels))
-        if levels.knows_directions:
-            host.measure(scene, levels.with_directions(), _PAGE_ORDER)
         clips = clips_of[scene]
-        _play(host, levels, clips[0].name if clips else None)
+        try:
+            _rehearse(host, levels, clips)
+        except Exception:  # its field computes nothing of use
+            if folder is None or not folder.has(levels):
+                raise
+            folder.refuse(levels.bundle.folder)
+            _logger.exception("bundle left out: %s", levels.bundle.folder)
+            host.drop(scene)
+            if (replaced := folder.replaced(scene)) is not None:
+                _rehearse(host, replaced, clips)
     fingerprint()
+
+
+def _rehearse(host: StreamHost, levels: FieldsByLevel, clips: Sequence[Clip]) -> None:
+    """Offer a scene, with all that its first stream would have to wait for."""
+    _offer(host, _measured(host, levels))
+    if levels.knows_directions:
+        host.measure(levels.bundle.id, levels.with_directions(), _PAGE_ORDER)
+    _play(host, levels, clips[0].name if clips else None)
 
 
 def _measured(host: StreamHost, levels: FieldsByLevel) -> MeasuredScene:

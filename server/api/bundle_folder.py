@@ -82,6 +82,14 @@ class BundleFolder:
         restored = {scene: self._others[scene] for scene in gone & self._others.keys()}
         return Changes(restored | loaded, frozenset(gone - self._others.keys()))
 
+    def has(self, levels: FieldsByLevel) -> bool:
+        """Whether a scene was loaded from here."""
+        return levels.bundle.folder in self._known
+
+    def replaced(self, scene: str) -> FieldsByLevel | None:
+        """The scene among the others that one of the folder takes the place of; None if there is none."""
+        return self._others.get(scene)
+
     def refuse(self, path: Path) -> None:
         """Count the bundle of a sub-folder as one that cannot be served as it is now."""
         if (known := self._known.get(path)) is not None:

@@ -1,5 +1,6 @@
 """Bundles that come, change and go while the server runs."""
 
+import asyncio
 import json
 import shutil
 import time
@@ -120,13 +121,6 @@ def test_a_folder_that_cannot_be_read_changes_nothing(bundle, watched, caplog):
     assert "cannot be read" in caplog.text
 
 
-@pytest.fixture
-def at_once(monkeypatch):
-    """What nothing waits for is measured at once: the folder is looked at again only after that."""
-    monkeypatch.setattr(app, "_COSTS_AFTER_S", 0.0)
-    monkeypatch.setattr(app, "_COSTS_SHARE", 1.0)
-
-
 @contextmanager
 def serving(watched, bundle, hrtfs):
     settings = Settings(bundle_folder=watched, bundle_folder_s=0.1, stall_timeout_s=120)
@@ -160,13 +154,12 @@ def received(socket, kind):
             return parsed
 
 
-@pytest.mark.usefixtures("at_once")
 def test_a_bundle_whose_field_fails_keeps_no_other_from_coming(bundle, hrtfs, watched, monkeypatch):
     usual = app._prepared
 
     def prepared(host, levels):
         if levels.bundle.id == "bad":
-            raise FieldError("field_failure", "no sound")
+            raise FieldError("no sound")
         return usual(host, levels)
 
     monkeypatch.setattr(app, "_prepared", prepared)
@@ -180,7 +173,60 @@ def test_a_bundle_whose_field_fails_keeps_no_other_from_coming(bundle, hrtfs, wa
         until(lambda: "later" in names(client))
 
 
-@pytest.mark.usefixtures("at_once")
+def test_a_bundle_whose_field_fails_at_the_start_keeps_no_other_from_being_served(bundle, hrtfs, watched, monkeypatch):
+    usual = app._measured
+
+    def measured(host, levels):
+        if levels.bundle.manifest.name == "Bad":
+            raise FieldError("no sound")
+        return usual(host, levels)
+
+    monkeypatch.setattr(app, "_measured", measured)
+    for folder, scene, name in (("a", "bad", "Bad"), ("b", "good", "Good"), ("c", "flat", "Bad")):
+        put(bundle, watched / folder, id=scene, name=name)
+    with serving(watched, bundle, hrtfs) as client:
+        assert names(client) == {"flat": bundle.manifest.name, "good": "Good"}
+        assert "nafir_bundles_refused 2" in client.get("/metrics").text
+        query = {"listener": "2,2,1.5", "emitter": "6,3,1.5"}
+        assert client.get("/v1/scenes/flat/impulse-response", params=query).status_code == 200
+        assert client.get("/v1/scenes/bad/impulse-response", params=query).status_code == 404
+        put(bundle, watched / "a", id="bad", name="Mended")
+        until(lambda: names(client).get("bad") == "Mended")
+        assert "nafir_bundles_refused 1" in client.get("/metrics").text
+
+
+def test_what_nothing_waits_for_is_prepared_once_at_a_time(monkeypatch):
+    at_once, most, begun = 0, 0, 0
+
+    async def scenario():
+        has_changed, may_end = asyncio.Event(), asyncio.Event()
+
+        async def prepare(_):
+            nonlocal at_once, most, begun
+            at_once, begun = at_once + 1, begun + 1
+            most = max(most, at_once)
+            await may_end.wait()
+            at_once -= 1
+
+        async def others():
+            for _ in range(20):
+                await asyncio.sleep(0)
+
+        monkeypatch.setattr(app, "_prepare_the_rest", prepare)
+        has_changed.set()
+        task = asyncio.create_task(app._keep_prepared(None, has_changed))
+        await others()
+        for _ in range(5):  # while the first is under way: one more time is enough
+            has_changed.set()
+            await others()
+        may_end.set()
+        await others()
+        task.cancel()
+
+    asyncio.run(scenario())
+    assert (most, begun) == (1, 2)
+
+
 def test_a_stream_finishes_with_the_scene_that_it_began_in(bundle, hrtfs, watched):
     put(bundle, watched / "hall", id="hall", name="A hall")
     with serving(watched, bundle, hrtfs) as client:
