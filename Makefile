@@ -29,7 +29,7 @@ EARS ?=
 SWEEP ?= --phases-of none --reuse-of factorised-r16
 # Which of the held-out pairs errors are of: those that the frontier did not choose levels by.
 MEASURE ?= --half report
-# How long either fuzzer runs, in seconds.
+# How long each fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
 # Folders with tests that watch the clock: collecting the others takes as long as many a test.
 TIMED := $(addprefix tests/,bench integration runtime streaming)
@@ -123,9 +123,10 @@ cluster-test: $(VENV)/installed-cluster ## install Ray, start two nodes of it he
 hard-cases: $(VENV)/installed-dev ## what could break numerically: every case's bound and measured margin, to hard-cases.md
 	$(BIN)/pytest --numprocesses auto --dist loadfile tests/hard_cases --hard-cases-table hard-cases.md
 
-fuzz: $(VENV)/installed-dev ## drive message parsing and bundle loading with atheris, FUZZ_SECONDS=60 each
+fuzz: $(VENV)/installed-dev ## drive message parsing and bundle loading with atheris, then a server with uploads; FUZZ_SECONDS=60 each
 	$(BIN)/python tests/hard_cases/fuzz.py messages --seconds $(FUZZ_SECONDS)
 	$(BIN)/python tests/hard_cases/fuzz.py bundles --seconds $(FUZZ_SECONDS)
+	FUZZ_SECONDS=$(FUZZ_SECONDS) $(BIN)/pytest -m attack -s tests/integration/attacks/test_fuzzing.py
 
 mutants: $(VENV)/installed-dev ## remove each guard in a copy of the tree and show which tests notice
 	$(BIN)/python tests/hard_cases/mutants.py

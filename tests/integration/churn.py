@@ -4,6 +4,7 @@ import asyncio
 import json
 import struct
 from itertools import count
+from typing import Any
 
 from websockets.asyncio.client import connect
 
@@ -18,7 +19,7 @@ _SEQUENCE_AT = 4
 
 async def visit(address: str, *, blocks: int, emitters: int, scene: str = SCENE, is_aborted: bool = False) -> None:
     """Hear so many blocks of so many emitters, walking; and leave with a goodbye, or drop the connection. Whoever is
-    refused comes back when told to."""
+    refused, or an emitter of theirs, comes back when told to."""
     while (wait_s := await _ask(address, blocks, emitters, scene, is_aborted)) is not None:  # noqa: ASYNC110  seconds told
         await asyncio.sleep(wait_s)
 
@@ -29,9 +30,8 @@ async def _ask(address: str, blocks: int, emitters: int, scene: str, is_aborted:
     async with connect(f"ws://{address}/v1/stream", compression=None, max_queue=None) as socket:
         await socket.send(hello.serialize())
         welcome = json.loads(await socket.recv())
-        if welcome.get("code") == "server_busy":
-            assert 1 <= welcome["retry_after_s"] <= 60
-            return welcome["retry_after_s"]
+        if welcome["type"] == "error":
+            return _wait_s(welcome)
         assert welcome["type"] == "welcome", welcome
         for number in range(emitters):
             place = (6.0, 3.0 - 0.3 * number, 1.5)
@@ -40,7 +40,9 @@ async def _ask(address: str, blocks: int, emitters: int, scene: str, is_aborted:
         while heard < blocks:
             message = await socket.recv()
             if isinstance(message, str):
-                assert json.loads(message)["type"] != "error", message
+                told = json.loads(message)
+                if told["type"] == "error":  # many begin at once: none of its emitters may be added just now
+                    return _wait_s(told)
                 continue
             assert message[0] == AudioBlock.KIND
             heard += 1
@@ -51,6 +53,13 @@ async def _ask(address: str, blocks: int, emitters: int, scene: str, is_aborted:
         if is_aborted:
             socket.transport.abort()
     return None
+
+
+def _wait_s(refusal: dict[str, Any]) -> int:
+    """After how many seconds to come back. No other refusal is expected."""
+    assert refusal["code"] == "server_busy", refusal
+    assert 1 <= refusal["retry_after_s"] <= 60
+    return refusal["retry_after_s"]
 
 
 async def churn(address: str, visits: int, *, at_once: int, blocks: int, emitters: int, scene: str = SCENE) -> None:

@@ -18,6 +18,7 @@ from server.scene.bundle import bundled_scenes
 
 _READY_S = 300.0
 """The first time ever, everything is compiled."""
+_MEASURED_S = 300.0
 _EXIT_S = 20.0
 _TRIES = 3
 
@@ -69,17 +70,42 @@ def _wait_until_ready(process: subprocess.Popen, port: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def attacked(request) -> Iterator[tuple[str, int]]:
-    """HOST:PORT and process id of a server with the module's ENVIRONMENT, where it has one."""
+def environment(request) -> dict[str, str]:
+    """Settings of the server to attack: the module's ENVIRONMENT, where it has one."""
+    return getattr(request.module, "ENVIRONMENT", {})
+
+
+@pytest.fixture(scope="module")
+def attacked(environment) -> Iterator[tuple[str, int]]:
+    """HOST:PORT and process id of a server with the `environment`."""
     if not any(folder.name == bystander.SCENE for folder in bundled_scenes()):
         pytest.skip(f"the {bystander.SCENE} is not bundled")
-    with _serving(**getattr(request.module, "ENVIRONMENT", {})) as server:
+    with _serving(**environment) as server:
         yield server
 
 
 @pytest.fixture
 def address(attacked) -> str:
     return attacked[0]
+
+
+@pytest.fixture(scope="module")
+def measured(attacked) -> str:
+    """HOST:PORT of a server that has measured what effects cost, for which it takes memory of its own."""
+    first = _costs_told(attacked[0])
+    until_s = time.monotonic() + _MEASURED_S
+    while _costs_told(attacked[0]) == first:
+        assert time.monotonic() < until_s, "the server never measured what effects cost"
+        time.sleep(0.2)
+    return attacked[0]
+
+
+def _costs_told(address: str) -> str | None:
+    """What a plan's costs are known by, of the scene that is measured last. Until the server has measured them beside
+    its streams, a question has them measured once, a little differently."""
+    path = f"/v1/scenes/{bundled_scenes()[-1].name}/plan?emitter=6,3,1.5"
+    with urllib.request.urlopen(f"http://{address}{path}", timeout=60) as answer:
+        return answer.headers["ETag"]
 
 
 @pytest.fixture

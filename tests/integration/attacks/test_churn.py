@@ -8,7 +8,6 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.scene.bundle import bundled_scenes
 from tests.integration.churn import churn
 
 pytestmark = pytest.mark.attack
@@ -17,9 +16,7 @@ SCENE = "apartment"
 VISITS, STEP = 1_000, 200
 AT_ONCE, EMITTERS, BLOCKS = 16, 4, 12
 MOST_GROWTH = 0.05
-_MEASURED_S = 300.0
 _SETTLED_S = 30.0
-_PLAN = "/v1/scenes/{scene}/plan?emitter=6,3,1.5"
 
 
 def ask(address, path):
@@ -37,27 +34,11 @@ def resident_mb(pid):
         return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def costs_told(address):
-    """What a plan's costs are known by, of the scene that is measured last. Until the server has measured them beside
-    its streams, a question has them measured once, a little differently."""
-    scene = bundled_scenes()[-1].name
-    with ask(address, _PLAN.format(scene=scene)) as answer:
-        return answer.headers["ETag"]
-
-
 def wait_until(is_so, within_s):
     until_s = time.monotonic() + within_s
     while not is_so():
         assert time.monotonic() < until_s
         time.sleep(0.2)
-
-
-@pytest.fixture
-def measured(address):
-    """HOST:PORT of a server that has measured what effects cost, for which it takes memory of its own."""
-    first = costs_told(address)
-    wait_until(lambda: costs_told(address) != first, _MEASURED_S)
-    return address
 
 
 def test_memory_is_flat_while_a_thousand_come_and_go(measured, server_pid):
