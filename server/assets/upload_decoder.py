@@ -114,10 +114,34 @@ async def decode_apart(source: Path, target: Path, limits: DecodingLimits) -> De
         raise RequestError("undecodable_clip", failed) from None
 
 
+class _Target:
+    """A file for libsndfile to write, which would lose what the disk says: its first error is kept."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.error: OSError | None = None
+        self.seek, self.tell = file.seek, file.tell
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        if self.error is None:
+            try:
+                return self._file.write(data)
+            except OSError as exc:
+                self.error = exc
+        return 0
+
+
 def decode_file(source: Path, target: IO[bytes], limits: DecodingLimits) -> Decoded:
-    """Decode in this process. Raises AudioFileError."""
+    """Decode in this process. Raises AudioFileError, and OSError if the disk does not take it."""
     samples, rate, warnings = read_mono(source, limit=lambda file: within(limits, file))
-    soundfile.write(target, samples, rate, format="WAV", subtype="FLOAT")
+    written = _Target(target)
+    try:
+        soundfile.write(written, samples, rate, format="WAV", subtype="FLOAT")
+    except (AssertionError, soundfile.LibsndfileError):  # it counts what was written by an assertion
+        if written.error is None:
+            raise
+    if written.error is not None:
+        raise written.error
     return Decoded(len(samples), rate, "; ".join(warnings))
 
 
@@ -154,7 +178,8 @@ def main(arguments: Sequence[str]) -> None:
     except MemoryError:
         answer = {"code": "undecodable_clip", "detail": "decoding it takes more memory than an upload may"}
     except (OSError, soundfile.LibsndfileError) as exc:
-        answer = {"code": "storage_failed", "detail": f"the decoded sound could not be written: {exc}"}
+        problem = exc.strerror if isinstance(exc, OSError) else exc  # not where the server has its files
+        answer = {"code": "storage_failed", "detail": f"the decoded sound could not be written: {problem}"}
     sys.stdout.write(json.dumps(answer))
 
 

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from prometheus_client import ProcessCollector
 from prometheus_client.parser import text_string_to_metric_families
 
 from server.api.kept_streams import KeptStreams
@@ -180,3 +181,10 @@ def test_refused_callers_are_counted_by_code_and_nothing_else_makes_a_label(host
     assert told.keys() == before.keys()
     counted = {dict(key[1:])["status"] + dict(key[1:])["reason"]: told[key] for key in refused if told[key]}
     assert counted == {"401key_refused": 1, "401other": 1, "429other": 1}
+
+
+def test_a_clock_that_is_set_does_not_look_like_a_restart(host, monkeypatch):
+    """The kernel tells when it started by the clock of the wall."""
+    began = samples(host)["process_start_time_seconds",]
+    monkeypatch.setattr(ProcessCollector, "_boot_time", lambda _: 0.0)
+    assert samples(host)["process_start_time_seconds",] == began

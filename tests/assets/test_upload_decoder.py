@@ -5,6 +5,7 @@ import os
 import signal
 import struct
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,6 +126,15 @@ def test_a_decoder_that_dies_or_never_ends_is_a_refusal(tmp_path, monkeypatch):
     assert (killed.code, killed.status) == ("undecodable_clip", 422)
     stopped = asyncio.run(fail(signal.SIGSTOP, DecodingLimits(seconds=2.0, decoding_s=0.5)))
     assert (stopped.code, "longer than 0.5 s" in str(stopped)) == ("undecodable_clip", True)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no device that is always full")
+@pytest.mark.parametrize("seconds", [0.01, 1.0])
+def test_a_disk_that_is_full_while_it_is_decoded_is_no_fault_of_the_file(tmp_path, seconds):
+    (tmp_path / "upload").write_bytes(encoded("flac", seconds))
+    with pytest.raises(RequestError, match=r"No space left on device$") as caught:
+        asyncio.run(decode_apart(tmp_path / "upload", Path("/dev/full"), LIMITS))
+    assert (caught.value.code, caught.value.status) == ("storage_failed", 507)
 
 
 def check_mutations(tmp_path, kinds, count, seed):

@@ -69,6 +69,12 @@ def _wait_until_ready(process: subprocess.Popen, port: int) -> None:
     raise AssertionError("the server never became ready")
 
 
+@pytest.fixture
+def serving():
+    """Starts servers of a test's own: as `attacked`, but with the settings given and for as long as the context."""
+    return _serving
+
+
 @pytest.fixture(scope="module")
 def environment(request) -> dict[str, str]:
     """Settings of the server to attack: the module's ENVIRONMENT, where it has one."""

@@ -278,7 +278,7 @@ def test_requests_by_the_document_are_answered_as_it_says(measured, server_pid, 
             command = [
                 *(sys.executable, "-m", "schemathesis.cli", "run", f"http://{measured}/openapi.json"),
                 *("--checks", "all", "--seed", str(next(seeds)), "--max-examples", "20", "--no-color"),
-                *("--phases", "examples,coverage,fuzzing"),
+                *("--phases", "examples,coverage,fuzzing", "--max-response-time", "60"),
             ]
             ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=1_200, check=False)
             assert ran.returncode == 0, ran.stdout + ran.stderr
