@@ -5,7 +5,9 @@ Beside the sound, `NAME.wav` (mono float, as `server.assets.upload_decoder` wrot
 and duration. A clip is there once both are: the second file is written last, and each under another name first. A
 server that is killed at any moment leaves at most files that the next one removes.
 
-Several processes may use one folder. Whatever changes it holds the lock of its file `.lock`.
+Several processes may use one folder. Whatever changes it holds the lock of its file `.lock`. Whoever receives a file
+holds a lock of that, too. The system gives it back when a process is killed: so what nobody holds is removed at once,
+and no clock that is set makes a file that is arriving look old.
 """
 
 import contextlib
@@ -33,10 +35,11 @@ try:
 except ImportError:  # not a POSIX system: only one process may use the folder
     fcntl = None  # type: ignore[assignment]
 
+_HAS_LOCKS: bool = fcntl is not None
 _NAME = re.compile(r"upload-[0-9a-f]{32}")
 _PART = ".part"
 _ABANDONED_S = 3_600.0
-"""Age from which on an unfinished file is nobody's any more."""
+"""Age from which on an unfinished file is nobody's any more, where the system has no locks."""
 _KEPT_BYTES = 256 * 2**20
 """Decoded clips that are kept in memory."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -58,7 +61,7 @@ class _Entry:
 
 
 class Incoming:
-    """A file that is arriving. `write` and `target` are for one thread at a time."""
+    """A file that is arriving, and held until it is discarded. `write` and `target` are for one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / f"{secrets.token_hex(16)}{_PART}"
@@ -67,6 +70,9 @@ class Incoming:
         self._hash = hashlib.sha256()
         self.size_bytes = 0
         self._file = self.path.open("xb", buffering=0)  # so that nothing is left to write when it is closed
+        self._held = self.path.open("rb")
+        if fcntl is not None:
+            fcntl.flock(self._held, fcntl.LOCK_EX)
 
     def write(self, data: bytes) -> None:
         """Raises RequestError storage_failed."""
@@ -86,6 +92,7 @@ class Incoming:
     def discard(self) -> None:
         """Remove what is left of it."""
         self.close()
+        self._held.close()
         for path in (self.path, self.target):
             with contextlib.suppress(OSError):
                 path.unlink()
@@ -120,7 +127,7 @@ class ClipStore:
 
     def receive(self) -> Incoming:
         """Begin to store a file. Raises RequestError storage_failed."""
-        with storing():
+        with storing(), self._locked():
             return Incoming(self._folder)
 
     def keep(self, incoming: Incoming, title: str, duration_s: float) -> tuple[Clip, bool]:
@@ -226,12 +233,25 @@ class ClipStore:
                 age_s = now_s - file.stat().st_mtime
                 name, _, suffix = file.name.partition(".")
                 if file.suffix == _PART:
-                    if age_s > _ABANDONED_S:
+                    if self._is_abandoned(name, age_s):
                         file.unlink()
                 elif suffix == "json" and is_upload(name) and age_s >= self._expires_s:
                     self._unlink(name)
                 elif suffix == "wav" and is_upload(name) and not self._label(name).exists():
                     file.unlink()
+
+    def _is_abandoned(self, name: str, age_s: float) -> bool:
+        """Whether nobody holds the unfinished file of a name."""
+        if not _HAS_LOCKS:
+            return age_s > _ABANDONED_S
+        try:
+            with (self._folder / f"{name}{_PART}").open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except FileNotFoundError:
+            pass
+        return True
 
     def _unlink(self, name: str) -> None:
         self._label(name).unlink(missing_ok=True)

@@ -172,8 +172,11 @@ def test_a_server_that_was_killed_leaves_only_what_the_next_removes(store, tmp_p
     clock.now_s = clip_store.time.time()
     open_store(tmp_path, clock, expires_s=4e9)
     assert f"{half}.wav" not in files(store)
-    assert unfinished.path.exists(), "another process may be writing it"
     clock.now_s += 2 * clip_store._ABANDONED_S
+    open_store(tmp_path, clock, expires_s=4e9)
+    assert unfinished.path.exists(), "another process is writing it, whatever the time is"
+    assert unfinished.target.exists()
+    unfinished._held.close()  # as the system does when that is killed
     after = open_store(tmp_path, clock, expires_s=4e9)
     assert files(after) == sorted([f"{clip.name}.json", f"{clip.name}.wav", "of somebody else.txt"])
 
