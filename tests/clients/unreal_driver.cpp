@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "Json.h"
 #include "Playback.h"
 #include "Pose.h"
 #include "Wire.h"
@@ -42,6 +43,22 @@ nafir::Pose ReadPose(std::istream& in) {
 void Print(const nafir::Pose& pose) {
   const auto& [p, q] = pose;
   std::cout << p.x << ' ' << p.y << ' ' << p.z << ' ' << q.x << ' ' << q.y << ' ' << q.z << ' ' << q.w;
+}
+
+std::string Written(const nafir::Json& value) {
+  std::string text;
+  switch (value.kind()) {
+    case nafir::Json::Kind::kNull: return "null";
+    case nafir::Json::Kind::kBool: return value.Bool() ? "true" : "false";
+    case nafir::Json::Kind::kNumber: return nafir::wire::Number(value.Number());
+    case nafir::Json::Kind::kText: return nafir::wire::Quoted(value.Text());
+    case nafir::Json::Kind::kArray:
+      for (const auto& each : value.Items()) text += (text.empty() ? "" : ",") + Written(each);
+      return "[" + text + "]";
+    default:
+      for (const auto& [name, each] : value.Members()) text += (text.empty() ? "" : ",") + nafir::wire::Quoted(name) + ":" + Written(each);
+      return "{" + text + "}";
+  }
 }
 
 // A tone through the buffer: a sender's clock `skew` faster than the sound card's, which reads 512 frames at a time; blocks between
@@ -121,6 +138,35 @@ int main() {
                 << nafir::message::SetGain("x", -6) << '\n'
                 << nafir::message::RemoveEmitter("x") << '\n'
                 << nafir::message::Acknowledge(4294967295U) << '\n';
+      nafir::AudioBlock last;
+      last.sequence = 7;
+      last.sample_clock = std::uint64_t{1} << 40;
+      nafir::Source shot, repeated, voice;
+      shot.clip = repeated.clip = "trumpet";
+      shot.pose = repeated.pose = voice.pose = pose;
+      shot.loop = false;
+      shot.start_at = 5000;
+      shot.stop_at = 100;
+      shot.offset_s = 0.5;
+      shot.remove_when_ended = true;
+      repeated.loop_start_s = 0.25;
+      repeated.loop_end_s = 1.5;
+      voice.jitter_ms = 40;
+      std::cout << nafir::message::Resume("a\"b", "", nullptr) << '\n'
+                << nafir::message::Resume("", "c2ln", &last) << '\n'
+                << nafir::message::AddEmitter("shot", shot, 1000) << '\n'
+                << nafir::message::AddEmitter("loop", repeated) << '\n'
+                << nafir::message::AddEmitter("voice", voice) << '\n'
+                << nafir::message::StopEmitter("x", 0.5, 5000, 1000) << '\n'
+                << nafir::message::StopEmitter("x", 0.01, std::nullopt) << '\n'
+                << nafir::message::SetGain("x", -6, 2.5) << '\n'
+                << nafir::message::SetLevel("auto") << '\n'
+                << nafir::message::Ping(9) << '\n'
+                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, "fine", true) << '\n';
+    } else if (command == "json") {
+      std::getline(in >> std::ws, text);
+      const auto read = nafir::Json::Parse(text);
+      std::cout << (read ? Written(*read) : "refused") << '\n';
     } else if (command == "play") {
       Play(in);
     }

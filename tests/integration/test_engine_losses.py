@@ -11,6 +11,7 @@ import pytest
 from tests.clients.test_godot import GODOT, QUIET, needs_godot
 from tests.clients.test_unity import MONO, needs_mono
 from tests.clients.test_unity import program as unity_program
+from tests.clients.test_unreal import compiled, needs_compiler
 from tests.clients.vectors import CLIENTS
 from tests.integration import losing
 from tests.integration.losing import until
@@ -37,10 +38,23 @@ def godot_command(_, url: str, seconds: float, output: Path, give_up_after_s: fl
     return [GODOT, "--path", CLIENTS / "godot", "-s", driver, *options]
 
 
+@pytest.fixture(scope="module")
+def unreal(tmp_path_factory) -> Path:
+    driver = CLIENTS.parent / "tests" / "clients" / "unreal_losses.cpp"
+    return compiled(driver, tmp_path_factory.mktemp("unreal") / "losses")
+
+
+def unreal_command(request, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+    host, port = url.removeprefix("ws://").removesuffix("/v1/stream").split(":")
+    program = request.getfixturevalue("unreal")
+    return [program, host, port, losing.CLIP, str(seconds), output, str(give_up_after_s)]
+
+
 @pytest.fixture(
     params=[
         pytest.param(unity_command, marks=needs_mono, id="unity"),
         pytest.param(godot_command, marks=needs_godot, id="godot"),
+        pytest.param(unreal_command, marks=needs_compiler, id="unreal"),
     ]
 )
 def player(request) -> Player:

@@ -1,6 +1,7 @@
 // A buffer between the network and the audio thread: one thread pushes, another reads, neither waits and neither allocates.
 // C++17, no types of Unreal.
 //
+// Where the sound has an end (the network stalls, blocks are missing, a lost stream goes on elsewhere) it fades out before and in after.
 // Samples are read at the output's rate by cubic interpolation. The pace follows the fill by at most 0.2 % (three cents), which makes up
 // for the difference between the server's clock and the sound card's.
 #pragma once
@@ -10,6 +11,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 namespace nafir {
@@ -21,7 +23,8 @@ class Playback {
       : channels_(channels),
         stream_rate_(stream_rate),
         step_(stream_rate / output_rate),
-        target_(std::max<double>(2 * kFade, target_s * stream_rate)),
+        fade_(kFadeS * stream_rate),
+        target_(std::max<double>(2 * fade_, target_s * stream_rate)),
         capacity_(static_cast<std::uint64_t>(target_ + kCapacityS * stream_rate)),
         ring_(capacity_ * channels) {}
 
@@ -36,6 +39,14 @@ class Playback {
     return true;
   }
 
+  // What is pushed next does not continue what was pushed before: fades out and in there, and holds back as much as at the beginning.
+  void Break() {
+    const unsigned count = seams_written_.load(std::memory_order_relaxed);
+    if (count - seams_read_.load(std::memory_order_acquire) == kMostSeams) return;  // a network of nothing but gaps
+    seams_[count % kMostSeams] = written_.load(std::memory_order_relaxed);
+    seams_written_.store(count + 1, std::memory_order_release);
+  }
+
   // Fills interleaved frames, on the audio thread; with silence until enough is there.
   void Read(float* output, std::size_t frames) {
     const std::uint64_t written = written_.load(std::memory_order_acquire);
@@ -43,16 +54,19 @@ class Playback {
     for (std::size_t i = 0; i < frames; ++i, output += channels_) {
       const double fill = static_cast<double>(written) - at_;
       if (!playing_ && fill >= target_) Start(written);
-      const double free = static_cast<double>(written) - at_ - kNeighbours;
+      const double seam = Seam();
+      const double free = std::min(static_cast<double>(written), seam) - at_ - kNeighbours;
       if (!playing_ || free < pace) {
-        if (playing_) underruns_.fetch_add(1, std::memory_order_relaxed);
+        const bool is_seam = seam <= static_cast<double>(written);
+        if (is_seam) at_ = seam;
+        if (playing_ && !is_seam) underruns_.fetch_add(1, std::memory_order_relaxed);
         playing_ = false;
         std::fill_n(output, channels_, 0.0F);
         continue;
       }
       // After a stall, too much comes at once: fades out, and goes on with the newest.
       if (fill > target_ + kMostS * stream_rate_) skipping_ = true;
-      gain_ = skipping_ ? gain_ - 1.0 / kFade : std::min({gain_ + 1.0 / kFade, free / kFade, 1.0});
+      gain_ = skipping_ ? gain_ - 1.0 / fade_ : std::min({gain_ + 1.0 / fade_, free / fade_, 1.0});
       if (skipping_ && gain_ <= 0) {
         Start(written);
         skipping_ = false;
@@ -66,9 +80,25 @@ class Playback {
   // How often the audio thread found too little.
   unsigned underruns() const { return underruns_.load(std::memory_order_relaxed); }
 
+  // Seconds of sound that wait.
+  double waiting_s() const {
+    const std::uint64_t read = read_.load(std::memory_order_acquire), written = written_.load(std::memory_order_acquire);
+    return written > read ? static_cast<double>(written - read) / stream_rate_ : 0;
+  }
+
  private:
-  static constexpr double kFade = 64, kNeighbours = 3, kCapacityS = 2, kMostS = 0.25;
+  static constexpr double kFadeS = 0.005, kNeighbours = 3, kCapacityS = 2, kMostS = 0.25;
+  static constexpr unsigned kMostSeams = 16;
   static constexpr double kSmoothingS = 1, kCorrectionS = 10, kMostCorrection = 0.002;
+
+  // Where the sound ends next, though more has been written.
+  double Seam() {
+    const unsigned count = seams_written_.load(std::memory_order_acquire);
+    unsigned passed = seams_read_.load(std::memory_order_relaxed);
+    while (passed != count && static_cast<double>(seams_[passed % kMostSeams]) <= at_) ++passed;
+    seams_read_.store(passed, std::memory_order_release);
+    return passed != count ? static_cast<double>(seams_[passed % kMostSeams]) : std::numeric_limits<double>::infinity();
+  }
 
   void Start(std::uint64_t written) {
     at_ = static_cast<double>(written) - target_;  // older frames of the same burst would only add delay
@@ -98,11 +128,12 @@ class Playback {
   }
 
   const unsigned channels_;
-  const double stream_rate_, step_, target_;
+  const double stream_rate_, step_, fade_, target_;
   const std::uint64_t capacity_;
   std::vector<float> ring_;
   std::atomic<std::uint64_t> written_{0}, read_{0};
-  std::atomic<unsigned> underruns_{0};
+  std::uint64_t seams_[kMostSeams] = {};  // frames before which the sound was interrupted
+  std::atomic<unsigned> seams_written_{0}, seams_read_{0}, underruns_{0};
   // Of the audio thread alone; positions are frames since the first.
   double at_ = 0, smooth_ = 0, gain_ = 0;
   bool playing_ = false, skipping_ = false;

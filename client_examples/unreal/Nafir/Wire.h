@@ -32,6 +32,18 @@ struct AudioBlock {
   std::vector<float> samples;
 };
 
+// What an emitter plays, and how. Without a clip it plays the samples that the client sends. Clocks are those of the stream.
+struct Source {
+  std::string clip;
+  Pose pose;
+  double gain_db = 0;
+  bool loop = true;
+  std::optional<std::uint64_t> start_at, stop_at;             // begins, and fades out; else at once, and never
+  double offset_s = 0, loop_start_s = 0, loop_end_s = 0;      // where the clip begins, and what repeats; an end of 0 is the clip's
+  bool remove_when_ended = false;                             // once the clip and its reverberation are over
+  double jitter_ms = 0;                                       // how long live samples wait at the server; 0 for its own choice
+};
+
 namespace wire {
 
 inline constexpr std::uint8_t kAudioBlock = 1, kListener = 2, kDryBlock = 3;
@@ -93,6 +105,9 @@ inline std::string Number(double value) {
   }
   return number;
 }
+
+// A clock of the stream as the server counts.
+inline std::string Clock(std::uint64_t clock, std::uint64_t offset) { return std::to_string(clock > offset ? clock - offset : 0); }
 
 inline std::string Numbers(const Pose& pose) {
   const auto& [p, q] = pose;
@@ -159,32 +174,79 @@ inline std::vector<std::uint8_t> SerializeDryBlock(std::string_view id, std::uin
 
 namespace message {
 
-// The first message. A `sample_rate` of 0 takes the scene's own.
-inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener) {
+// The first message. A `sample_rate` of 0 takes the scene's own; without a `level` the server chooses. With `snapshots` a server that has a
+// secret sends the stream's state now and then.
+inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener,
+                         std::string_view level = {}, bool snapshots = false) {
   std::string text = "{\"type\":\"hello\",\"protocol\":" + std::to_string(kProtocol) + ",\"scene\":" + wire::Quoted(scene) +
                      ",\"block_size\":" + std::to_string(block_size) + ",\"encoding\":\"" + NameOf(encoding) +
                      "\",\"buffer_blocks\":" + std::to_string(buffer_blocks) + ",\"listener\":{" + wire::Numbers(listener) + "}";
   if (sample_rate > 0) text += ",\"sample_rate\":" + std::to_string(sample_rate);
+  if (!level.empty()) text += ",\"level\":" + wire::Quoted(level);
+  if (snapshots) text += ",\"snapshots\":true";
+  return text + "}";
+}
+
+// The first message of a connection that goes on with a lost stream: the token of the last welcome and the newest snapshot, of which one may
+// be empty, and the last block that arrived, if one has.
+inline std::string Resume(std::string_view token, std::string_view snapshot, const AudioBlock* last) {
+  std::string text = "{\"type\":\"resume\",\"protocol\":" + std::to_string(kProtocol);
+  if (!token.empty()) text += ",\"token\":" + wire::Quoted(token);
+  if (!snapshot.empty()) text += ",\"snapshot\":" + wire::Quoted(snapshot);
+  if (last != nullptr) text += ",\"sequence\":" + std::to_string(last->sequence) + ",\"sample_clock\":" + std::to_string(last->sample_clock);
+  return text + "}";
+}
+
+// The stream's clock is `clock_offset` samples ahead of the server's.
+inline std::string AddEmitter(std::string_view id, const Source& source, std::uint64_t clock_offset = 0) {
+  std::string text = "{\"type\":\"add_emitter\",\"id\":" + wire::Quoted(id) + "," + wire::Numbers(source.pose) +
+                     ",\"gain_db\":" + wire::Number(source.gain_db);
+  if (source.clip.empty()) {
+    text += ",\"live\":true";
+    if (source.jitter_ms > 0) text += ",\"jitter_ms\":" + wire::Number(source.jitter_ms);
+    return text + "}";
+  }
+  text += ",\"clip\":" + wire::Quoted(source.clip) + ",\"loop\":" + (source.loop ? "true" : "false");
+  if (source.start_at) text += ",\"start_at\":" + wire::Clock(*source.start_at, clock_offset);
+  if (source.stop_at) text += ",\"stop_at\":" + wire::Clock(*source.stop_at, clock_offset);
+  if (source.offset_s > 0) text += ",\"offset_s\":" + wire::Number(source.offset_s);
+  if (source.loop && source.loop_start_s > 0) text += ",\"loop_start_s\":" + wire::Number(source.loop_start_s);
+  if (source.loop && source.loop_end_s > 0) text += ",\"loop_end_s\":" + wire::Number(source.loop_end_s);
+  if (source.remove_when_ended) text += ",\"remove_when_ended\":true";
   return text + "}";
 }
 
 // An emitter that plays a clip of the server.
 inline std::string AddClip(std::string_view id, std::string_view clip, const Pose& pose, double gain_db = 0, bool loop = true) {
-  return "{\"type\":\"add_emitter\",\"id\":" + wire::Quoted(id) + ",\"clip\":" + wire::Quoted(clip) + "," + wire::Numbers(pose) +
-         ",\"gain_db\":" + wire::Number(gain_db) + ",\"loop\":" + (loop ? "true" : "false") + "}";
+  Source source;
+  source.clip = clip;
+  source.pose = pose;
+  source.gain_db = gain_db;
+  source.loop = loop;
+  return AddEmitter(id, source);
 }
 
 // An emitter that plays the dry blocks that the client sends for it.
-inline std::string AddLive(std::string_view id, const Pose& pose, double gain_db = 0) {
-  return "{\"type\":\"add_emitter\",\"id\":" + wire::Quoted(id) + ",\"live\":true," + wire::Numbers(pose) + ",\"gain_db\":" + wire::Number(gain_db) + "}";
+inline std::string AddLive(std::string_view id, const Pose& pose, double gain_db = 0) { return AddClip(id, {}, pose, gain_db); }
+
+// Lets a clip fade out from a clock on, or at once.
+inline std::string StopEmitter(std::string_view id, double fade_s, std::optional<std::uint64_t> stop_at, std::uint64_t clock_offset = 0) {
+  std::string text = "{\"type\":\"stop_emitter\",\"id\":" + wire::Quoted(id) + ",\"fade_s\":" + wire::Number(fade_s);
+  if (stop_at) text += ",\"stop_at\":" + wire::Clock(*stop_at, clock_offset);
+  return text + "}";
 }
+
+inline std::string SetLevel(std::string_view level) { return "{\"type\":\"set_level\",\"level\":" + wire::Quoted(level) + "}"; }
+
+inline std::string Ping(std::uint32_t id) { return "{\"type\":\"ping\",\"id\":" + std::to_string(id) + "}"; }
 
 inline std::string MoveEmitter(std::string_view id, std::uint32_t pose_id, const Pose& pose) {
   return "{\"type\":\"move_emitter\",\"id\":" + wire::Quoted(id) + ",\"pose_id\":" + std::to_string(pose_id) + "," + wire::Numbers(pose) + "}";
 }
 
-inline std::string SetGain(std::string_view id, double gain_db) {
-  return "{\"type\":\"set_gain\",\"id\":" + wire::Quoted(id) + ",\"gain_db\":" + wire::Number(gain_db) + "}";
+// The gain is reached over `ramp_s` seconds, linearly in decibels.
+inline std::string SetGain(std::string_view id, double gain_db, double ramp_s = 0) {
+  return "{\"type\":\"set_gain\",\"id\":" + wire::Quoted(id) + ",\"gain_db\":" + wire::Number(gain_db) + ",\"ramp_s\":" + wire::Number(ramp_s) + "}";
 }
 
 inline std::string RemoveEmitter(std::string_view id) { return "{\"type\":\"remove_emitter\",\"id\":" + wire::Quoted(id) + "}"; }

@@ -1,0 +1,533 @@
+// A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and frames to play. It keeps what is wanted (poses,
+// emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
+// C++17, no types of Unreal, no exceptions. All but Read is for one thread.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <deque>
+#include <functional>
+#include <map>
+#include <memory>
+#include <optional>
+#include <random>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "Json.h"
+#include "Playback.h"
+#include "Pose.h"
+#include "Wire.h"
+
+namespace nafir {
+
+// kWaiting is a stream whose connection is lost and is going to be tried again. kRefused and kLost are final: the server does not want the
+// stream, or could not be reached for too long.
+enum class State { kConnecting, kLive, kWaiting, kRefused, kLost };
+
+inline const char* NameOf(State state) {
+  constexpr const char* kNames[] = {"Connecting", "Live", "Waiting", "Refused", "Lost"};
+  return kNames[static_cast<int>(state)];
+}
+
+// Counts run over all connections of a stream. A block is skipped by the server, or lost with a connection.
+struct Statistics {
+  std::uint64_t blocks = 0, blocks_late = 0, blocks_skipped = 0;
+  unsigned underruns = 0, reconnections = 0, resumptions = 0;
+  double round_trip_s = 0, waiting_s = 0;
+};
+
+struct SessionOptions {
+  std::string scene = "apartment";
+  int sample_rate = 0;  // 44100, 48000 or 96000; 0 takes the scene's own
+  int block_size = 256;
+  int buffer_blocks = 8;
+  double output_rate = 48000;    // of Read
+  double target_s = 0.06;        // held back against a network that stalls
+  double give_up_after_s = 300;  // for so long a server that is gone is tried again
+};
+
+class Session {
+ public:
+  enum class Todo { kNothing, kConnect, kDrop };
+
+  struct Outgoing {
+    bool is_text;
+    std::string data;
+  };
+
+  // What the game may want to know. Called within the calls below.
+  std::function<void(State)> on_state;                                          // problem() says why
+  std::function<void(const std::string& id)> on_emitter_added;                  // it is heard
+  std::function<void(const std::string& id)> on_emitter_ended;                  // with its reverberation, or it cannot go on after a loss
+  std::function<void(const std::string& id, const std::string& why)> on_emitter_refused;
+
+  explicit Session(SessionOptions options) : options_(std::move(options)) {}
+
+  State state() const { return state_; }
+  const std::string& problem() const { return problem_; }  // why the stream was refused or last lost
+  const std::string& level() const { return level_; }
+  int sample_rate() const { return sample_rate_; }  // 0 before the first welcome
+  // The clock of the frame after the newest block, which goes on over lost connections.
+  std::uint64_t sample_clock() const { return sample_clock_; }
+  std::uint32_t heard_pose_id() const { return heard_pose_id_; }
+
+  Statistics statistics() const {
+    Statistics found = counts_;
+    if (!playbacks_.empty()) {
+      found.underruns = playbacks_.back()->underruns();
+      found.waiting_s = playbacks_.back()->waiting_s();
+    }
+    return found;
+  }
+
+  // ---- what the game wants
+
+  void SetListener(const Pose& pose) {
+    listener_ = pose;
+    listener_moved_ = true;
+  }
+
+  // Adds an emitter, or moves the one with this id. Another clip than before begins anew.
+  void SetEmitter(const std::string& id, const Source& source) {
+    const auto found = emitters_.find(id);
+    if (found != emitters_.end() && found->second.source.clip == source.clip) {
+      Emitter& emitter = found->second;
+      if (emitter.source.gain_db != source.gain_db) Order(message::SetGain(id, source.gain_db));
+      emitter.source = source;
+      emitter.moved = true;
+      return;
+    }
+    if (found != emitters_.end()) RemoveEmitter(id);
+    Emitter& emitter = emitters_[id];
+    emitter.source = source;
+    Prepare(emitter);
+    Add(id, emitter);
+  }
+
+  // Plays a clip once, as soon as it can be heard or from a clock on. Returns the id of its emitter, which is removed once the clip and its
+  // reverberation are over.
+  std::string PlayOnce(const std::string& clip, const Pose& pose, double gain_db = 0, std::optional<std::uint64_t> start_at = std::nullopt) {
+    Source source;
+    source.clip = clip;
+    source.pose = pose;
+    source.gain_db = gain_db;
+    source.loop = false;
+    source.start_at = start_at;
+    source.remove_when_ended = true;
+    const std::string id = "shot" + std::to_string(++shots_);
+    SetEmitter(id, source);
+    return id;
+  }
+
+  // Moves an emitter that is there.
+  void MoveEmitter(const std::string& id, const Pose& pose) {
+    const auto found = emitters_.find(id);
+    if (found == emitters_.end()) return;
+    found->second.source.pose = pose;
+    found->second.moved = true;
+  }
+
+  // Changes a gain over some seconds, linearly in decibels.
+  void SetGain(const std::string& id, double gain_db, double ramp_s = 0) {
+    const auto found = emitters_.find(id);
+    if (found == emitters_.end()) return;
+    found->second.source.gain_db = gain_db;
+    Order(message::SetGain(id, gain_db, ramp_s));
+  }
+
+  // Lets a clip fade out from a clock on, or at once. on_emitter_ended follows.
+  void StopEmitter(const std::string& id, double fade_s = 0.01, std::optional<std::uint64_t> stop_at = std::nullopt) {
+    const auto found = emitters_.find(id);
+    if (found == emitters_.end() || found->second.source.clip.empty()) return;
+    found->second.is_stopped = true;
+    Order(message::StopEmitter(id, fade_s, stop_at, clock_offset_));
+  }
+
+  void RemoveEmitter(const std::string& id) {
+    if (emitters_.erase(id) > 0) Order(message::RemoveEmitter(id));
+  }
+
+  // Chooses a quality level, or auto.
+  void SetLevel(const std::string& level) {
+    wanted_level_ = level;
+    Order(message::SetLevel(level));
+  }
+
+  // Takes the next mono samples of a live emitter, at the output's rate. Returns false while it is not heard yet or if there is no room.
+  bool PushDry(const std::string& id, const float* samples, std::size_t frames) {
+    const auto found = emitters_.find(id);
+    return found != emitters_.end() && found->second.is_heard && found->second.dry && found->second.dry->Push(samples, frames);
+  }
+
+  // ---- the connection, whose socket is another's
+
+  // A connection is being made.
+  void Begin() {
+    if (state_ != State::kWaiting) Become(State::kConnecting);
+    is_trying_ = true;
+    silent_s_ = 0;
+    last_error_ = Json();
+  }
+
+  std::string FirstMessage() const {
+    if (CanResume()) return message::Resume(token_, snapshot_, has_block_ ? &block_ : nullptr);
+    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true);
+  }
+
+  // The connection has ended, with a close code if there was one, or there came none.
+  void Lost(const std::string& why, int code = 0) {
+    outgoing_.clear();
+    is_trying_ = false;
+    const bool was_live = state_ == State::kLive;
+    if (was_live) {
+      attempt_ = 0;
+      since_lost_s_ = 0;
+    }
+    problem_ = why;
+    double advised_s = 0;
+    if (last_error_.IsObject()) {
+      problem_ = last_error_["code"].Text() + ": " + last_error_["message"].Text();
+      advised_s = last_error_["retry_after_s"].Number();
+      if (last_error_["code"].Text() == "unknown_resume_token" && CanResume()) {
+        Forget();  // begins anew
+        wait_s_ = 0;
+        return;
+      }
+    }
+    if (advised_s == 0 && (IsFinal(code) || (last_error_.IsObject() && !was_live))) return Become(State::kRefused);
+    // With chance, so that the clients of a server that comes back do not all come at once.
+    constexpr double kRetryS[] = {0.25, 0.5, 1, 2, 4, 8, 15};
+    const double own_s = kRetryS[std::min(attempt_, 6)] * std::uniform_real_distribution<>(0.5, 1)(luck_);
+    wait_s_ = advised_s > 0 ? advised_s : own_s;
+    ++attempt_;
+    Become(since_lost_s_ + wait_s_ <= options_.give_up_after_s ? State::kWaiting : State::kLost);
+  }
+
+  // Time passes. Returns what is to be done with the socket; kDrop is followed by Lost.
+  Todo Step(double seconds) {
+    step_s_ = seconds;
+    since_block_s_ += seconds;
+    if (state_ != State::kLive) since_lost_s_ += seconds;
+    if (state_ == State::kWaiting && !is_trying_) {
+      wait_s_ -= seconds;
+      return wait_s_ <= 0 ? Todo::kConnect : Todo::kNothing;
+    }
+    if (is_trying_ || state_ == State::kLive) {
+      silent_s_ += seconds;
+      if (silent_s_ > kSilenceS) return Todo::kDrop;
+    }
+    if (state_ != State::kLive) return Todo::kNothing;
+    since_ping_s_ += seconds;
+    if (since_ping_s_ >= kPingIntervalS) {
+      since_ping_s_ = 0;
+      Say(message::Ping(++ping_id_));
+    }
+    for (auto& [id, emitter] : emitters_) {
+      if (!emitter.is_refused || emitter.ask_again_s <= 0) continue;
+      emitter.ask_again_s -= seconds;
+      if (emitter.ask_again_s <= 0) Add(id, emitter);
+    }
+    since_poses_s_ += seconds;
+    if (since_poses_s_ >= kPoseIntervalS) SayPoses();
+    return Todo::kNothing;
+  }
+
+  // Takes a text message. One that is of no known type, or cannot be read, changes nothing.
+  void Receive(std::string_view text) {
+    silent_s_ = 0;
+    const std::optional<Json> parsed = Json::Parse(text);
+    if (!parsed) return;
+    const Json& message = *parsed;
+    const std::string &type = message["type"].Text(), &id = message["id"].Text();
+    if (type == "welcome") {
+      Welcome(message);
+    } else if (type == "error") {
+      Refused(message);
+    } else if (type == "snapshot") {
+      snapshot_ = message["snapshot"].Text();
+      Handled(Count(message["handled"]));
+    } else if (type == "level_changed") {
+      level_ = message["level"].Text();
+    } else if (type == "pong") {
+      if (message["id"].Number() == ping_id_) counts_.round_trip_s = since_ping_s_ + step_s_;
+    } else if (type == "emitter_added") {
+      const auto found = emitters_.find(id);
+      if (found == emitters_.end()) return;
+      Open(found->second, Count(message["sample_clock"]));
+      if (on_emitter_added) on_emitter_added(id);
+    } else if (type == "emitter_ended") {
+      if (message["removed"].Bool()) emitters_.erase(id);
+      if (on_emitter_ended) on_emitter_ended(id);
+    }
+  }
+
+  // Takes a binary message. Returns whether it was a block; another kind, or a damaged one, changes nothing.
+  bool ReceiveBlock(const std::uint8_t* data, std::size_t size) {
+    silent_s_ = 0;
+    std::optional<AudioBlock> parsed = ParseAudioBlock(data, size, kEncoding);
+    if (!parsed || parsed->channels != 2 || playbacks_.empty()) return false;
+    block_ = std::move(*parsed);
+    const std::uint64_t frames = block_.samples.size() / 2;
+    if (!has_block_ || block_.sample_clock != next_clock_) playbacks_.back()->Break();
+    if (has_block_ && block_.sample_clock > next_clock_ && frames > 0) counts_.blocks_skipped += (block_.sample_clock - next_clock_) / frames;
+    playbacks_.back()->Push(block_.samples.data(), frames);
+    ++counts_.blocks;
+    if (block_.flags & kLate) ++counts_.blocks_late;
+    has_block_ = true;
+    since_block_s_ = 0;
+    next_clock_ = block_.sample_clock + frames;
+    sample_clock_ = next_clock_ + clock_offset_;
+    heard_pose_id_ = block_.pose_id;
+    if (block_.sequence % kAcknowledgeEvery == kAcknowledgeEvery - 1) Say(message::Acknowledge(block_.sequence));
+    for (auto& [id, emitter] : emitters_) SendDry(id, emitter, frames);
+    return true;
+  }
+
+  // The oldest message that is to be sent.
+  std::optional<Outgoing> Take() {
+    if (outgoing_.empty()) return std::nullopt;
+    Outgoing first = std::move(outgoing_.front());
+    outgoing_.pop_front();
+    return first;
+  }
+
+  // Fills interleaved frames of both ears, on the audio thread: no locks, no allocation.
+  void Read(float* output, std::size_t frames) {
+    if (Playback* const from = playing_.load(std::memory_order_acquire)) {
+      from->Read(output, frames);
+    } else {
+      std::fill_n(output, 2 * frames, 0.0F);
+    }
+  }
+
+ private:
+  static constexpr Encoding kEncoding = Encoding::kInt16;
+  static constexpr std::uint32_t kAcknowledgeEvery = 4;
+  static constexpr std::uint64_t kBlocksAhead = 4;
+  static constexpr std::uint8_t kLate = 2;
+  static constexpr std::size_t kMostOrders = 1024, kMostWaiting = 4096;
+  static constexpr double kPoseIntervalS = 0.012, kPingIntervalS = 1, kLiveTargetS = 0.04;
+  static constexpr double kSilenceS = 4;  // a server that sends audio is never silent for so long
+
+  struct Emitter {
+    Source source;
+    bool moved = false, is_heard = false, is_stopped = false, is_refused = false;
+    double ask_again_s = 0;          // after a refusal; 0 for never
+    std::uint64_t number = 0;        // of the order that adds it
+    std::unique_ptr<Playback> dry;   // of a live one; from the output's rate to the stream's
+    std::uint32_t sequence = 0;
+    std::uint64_t start_clock = 0, sent_frames = 0;  // of the server
+
+    bool PlaysOnce() const { return !source.clip.empty() && (!source.loop || is_stopped); }
+  };
+
+  static std::uint64_t Count(const Json& number) { return static_cast<std::uint64_t>(std::max(0.0, number.Number())); }
+
+  // Close codes after which a new connection would do no better.
+  static bool IsFinal(int code) {
+    return code == 1000 || code == 1002 || code == 1003 || (code >= 1007 && code <= 1010) || (code >= 4400 && code < 4500);
+  }
+
+  bool CanResume() const { return !token_.empty() || !snapshot_.empty(); }
+
+  // Lets go of the stream that there was, so that the next connection begins anew.
+  void Forget() {
+    token_.clear();
+    snapshot_.clear();
+    orders_.clear();
+    ordered_ = 0;
+  }
+
+  void Become(State next) {
+    if (state_ == next) return;
+    state_ = next;
+    if (on_state) on_state(next);
+  }
+
+  void Welcome(const Json& message) {
+    sample_rate_ = static_cast<int>(message["sample_rate"].Number());
+    level_ = message["level"].Text();
+    token_ = message["resume_token"].Text();
+    listener_moved_ = true;
+    is_trying_ = false;
+    attempt_ = 0;
+    if (playbacks_.empty() || playback_rate_ != sample_rate_) {
+      // The audio thread may be reading the last one still, so that it stays.
+      playbacks_.push_back(std::make_unique<Playback>(2, sample_rate_, options_.output_rate, options_.target_s));
+      playing_.store(playbacks_.back().get(), std::memory_order_release);
+      playback_rate_ = sample_rate_;
+    }
+    if (was_welcomed_) ++counts_.reconnections;
+    was_welcomed_ = true;
+    state_ = State::kLive;  // so that what follows is said; the game is told once it has been
+    const Json& resumed = message["resumed"];
+    if (resumed.IsObject()) {
+      GoOn(Count(resumed["handled"]), Count(resumed["sample_clock"]), static_cast<std::uint32_t>(Count(resumed["pose_id"])));
+    } else {
+      BeginAnew();
+    }
+    if (on_state) on_state(state_);
+  }
+
+  // The server has the stream still: it gets what it has not handled, and where everything is now.
+  void GoOn(std::uint64_t handled, std::uint64_t clock, std::uint32_t pose_id) {
+    ++counts_.resumptions;
+    Handled(handled);
+    for (const std::string& each : orders_) outgoing_.push_back({true, each});
+    pose_id_ = std::max(pose_id_, pose_id);
+    for (auto& [id, emitter] : emitters_) {
+      emitter.moved = true;
+      // What was added is there, and that it is heard may have been said just before the connection was lost.
+      if (emitter.is_heard || emitter.number <= handled) Open(emitter, clock);
+    }
+  }
+
+  // The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
+  void BeginAnew() {
+    if (has_block_) {
+      const double away_s = std::max(0.0, since_block_s_ - static_cast<double>(options_.buffer_blocks * options_.block_size) / sample_rate_);
+      clock_offset_ = sample_clock_ + static_cast<std::uint64_t>(away_s * sample_rate_);
+    }
+    has_block_ = false;
+    snapshot_.clear();
+    orders_.clear();
+    ordered_ = 0;
+    pose_id_ = 0;
+    std::vector<std::string> over;
+    for (auto& [id, emitter] : emitters_) {
+      if (emitter.is_heard && emitter.PlaysOnce()) {
+        over.push_back(id);
+        continue;
+      }
+      Prepare(emitter);
+      Add(id, emitter);
+    }
+    for (const std::string& id : over) {
+      emitters_.erase(id);
+      if (on_emitter_ended) on_emitter_ended(id);
+    }
+  }
+
+  void Prepare(Emitter& emitter) {
+    emitter.is_heard = emitter.moved = false;
+    emitter.sequence = 0;
+    if (emitter.source.clip.empty() && sample_rate_ > 0) {
+      emitter.dry = std::make_unique<Playback>(1, options_.output_rate, sample_rate_, kLiveTargetS);
+    }
+  }
+
+  // The server hears the emitter from a clock on, and has no samples of it yet.
+  static void Open(Emitter& emitter, std::uint64_t clock) {
+    emitter.is_heard = true;
+    emitter.start_clock = clock;
+    emitter.sent_frames = 0;
+  }
+
+  void Add(const std::string& id, Emitter& emitter) {
+    emitter.is_refused = false;
+    Order(message::AddEmitter(id, emitter.source, clock_offset_));
+    emitter.number = ordered_;
+  }
+
+  void Refused(const Json& error) {
+    problem_ = error["code"].Text() + ": " + error["message"].Text();
+    const std::string& id = error["emitter"].Text();
+    if (id.empty()) {
+      last_error_ = error;
+      return;
+    }
+    const auto found = emitters_.find(id);
+    if (found == emitters_.end()) return;
+    Emitter& emitter = found->second;
+    if (!emitter.is_heard) {
+      emitter.is_refused = true;
+      emitter.ask_again_s = error["retry_after_s"].Number();
+      if (on_emitter_refused) on_emitter_refused(id, problem_);
+    } else if (error["code"].Text() == "unknown_emitter" && emitter.PlaysOnce()) {
+      const std::string ended = id;  // its end was said just before the connection was lost
+      emitters_.erase(found);
+      if (on_emitter_ended) on_emitter_ended(ended);
+    }
+  }
+
+  void SendDry(const std::string& id, Emitter& emitter, std::uint64_t frames) {
+    if (!emitter.source.clip.empty() || !emitter.is_heard || block_.sample_clock < emitter.start_clock) return;
+    // The server's clock counts: as many samples as it has rendered, and a few blocks ahead.
+    const std::uint64_t due = block_.sample_clock - emitter.start_clock + (1 + kBlocksAhead) * frames;
+    for (; emitter.sent_frames < due; emitter.sent_frames += frames) {
+      dry_.resize(frames);
+      emitter.dry->Read(dry_.data(), frames);
+      const std::vector<std::uint8_t> bytes = SerializeDryBlock(id, emitter.sequence++, dry_.data(), frames, kEncoding);
+      SayBinary(bytes.data(), bytes.size());
+    }
+  }
+
+  void SayPoses() {
+    since_poses_s_ = 0;
+    for (auto& [id, emitter] : emitters_) {
+      if (!emitter.moved || emitter.is_refused) continue;
+      emitter.moved = false;
+      Say(message::MoveEmitter(id, ++pose_id_, emitter.source.pose));
+    }
+    if (!listener_moved_) return;
+    listener_moved_ = false;
+    const auto bytes = SerializeListener(++pose_id_, listener_);
+    SayBinary(bytes.data(), bytes.size());
+  }
+
+  // Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted when it does.
+  void Order(const std::string& text) {
+    if (state_ != State::kLive && !CanResume()) return;
+    orders_.push_back(text);
+    ++ordered_;
+    if (orders_.size() > kMostOrders) {
+      orders_.pop_front();
+      if (state_ != State::kLive) return Forget();  // too much was said to go on with the stream
+    }
+    if (state_ == State::kLive) outgoing_.push_back({true, text});
+  }
+
+  // So many orders need not be sent again.
+  void Handled(std::uint64_t count) {
+    while (!orders_.empty() && ordered_ - orders_.size() < count) orders_.pop_front();
+  }
+
+  // Says what a lost connection makes idle.
+  void Say(std::string text) {
+    if (state_ == State::kLive && outgoing_.size() < kMostWaiting) outgoing_.push_back({true, std::move(text)});
+  }
+
+  void SayBinary(const std::uint8_t* data, std::size_t size) {
+    if (state_ == State::kLive && outgoing_.size() < kMostWaiting) outgoing_.push_back({false, std::string(reinterpret_cast<const char*>(data), size)});
+  }
+
+  const SessionOptions options_;
+  State state_ = State::kConnecting;
+  std::string problem_, level_, wanted_level_;
+  Statistics counts_;
+  Pose listener_;
+  bool listener_moved_ = false, is_trying_ = false, was_welcomed_ = false;
+  std::map<std::string, Emitter> emitters_;
+  std::deque<Outgoing> outgoing_;
+  std::deque<std::string> orders_;  // the newest messages that the server counts, and how many there were
+  std::uint64_t ordered_ = 0;
+  std::string token_, snapshot_;  // with which the stream is resumed
+  Json last_error_;               // of the whole stream, in this connection
+  int attempt_ = 0, sample_rate_ = 0, playback_rate_ = 0, shots_ = 0;
+  double wait_s_ = 0, since_lost_s_ = 0, since_block_s_ = 0, since_ping_s_ = 0, since_poses_s_ = 0, silent_s_ = 0;
+  double step_s_ = 0;  // to which time is known
+  std::uint32_t pose_id_ = 0, ping_id_ = 0, heard_pose_id_ = 0;
+  bool has_block_ = false;  // since the stream began; it is in block_
+  AudioBlock block_;
+  std::uint64_t next_clock_ = 0, clock_offset_ = 0, sample_clock_ = 0;  // of the server; what is added to it
+  std::vector<float> dry_;
+  std::vector<std::unique_ptr<Playback>> playbacks_;
+  std::atomic<Playback*> playing_{nullptr};
+  std::mt19937 luck_{std::random_device{}()};
+};
+
+}  // namespace nafir

@@ -1,0 +1,9 @@
+#pragma once
+
+#include "CoreMinimal.h"
+
+class APlayerCameraManager {
+ public:
+  FVector GetCameraLocation() const { return {}; }
+  FRotator GetCameraRotation() const { return {}; }
+};

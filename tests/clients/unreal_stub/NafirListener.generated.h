@@ -1,0 +1,1 @@
+// Written by the engine's own tool where there is one.
