@@ -152,6 +152,9 @@ def examine(
     rng = np.random.default_rng(seed)
     space = sample_space(np.concatenate([work.corners, *leaves]))
     air, rooms, problems = _rooms(level, space, is_open=is_open)
+    if not rooms and not is_open:
+        detail = "inside and outside are joined, so nothing says which side of a triangle the air is on"
+        work.findings.append(Finding("no closed room", 1, "told", detail))
     sides = space.sides(work.corners, air)
     turned = _turn(work, topology, sides)
     unheard = _unheard(work, topology, sides)

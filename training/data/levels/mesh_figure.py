@@ -38,7 +38,7 @@ _EDGES: dict[str, tuple[str, Literal[":", "-"], str]] = {
 _RAYS, _PLACES = "#f07a8d", "#2b3a42"
 _MOST_STOREYS = 6
 _MOST_FACES_IN_3D = 15_000
-_STOREY_M = 2.0
+_STOREY_M, _FLOOR_SHARE = 2.0, 0.25
 _CUT_M = 1.3
 """Plans are cut at this height above the floor of a storey, as architects' are."""
 
@@ -72,7 +72,7 @@ def figure_of(examination: Examination, title: str, places: Sequence[tuple[str, 
 
 
 def storeys_of(examination: Examination) -> list[tuple[float, float]]:
-    """(floor, ceiling) of each storey: heights at which much of the area faces up, at least so far apart."""
+    """(floor, ceiling) of each storey, from the lowest: heights at which much area faces up, a storey apart."""
     mesh = examination.mesh
     low, high = float(mesh.bounds_m[0, 2]), float(mesh.bounds_m[1, 2])
     level = mesh.normals[:, 2] > 0.9
@@ -81,13 +81,11 @@ def storeys_of(examination: Examination) -> list[tuple[float, float]]:
     if len(heights):
         edges = np.arange(low - 0.1, high + 0.3, 0.2)
         counts, _ = np.histogram(heights, edges, weights=areas)
-        for index in np.argsort(-counts, kind="stable"):
-            at = heights[(heights >= edges[index]) & (heights < edges[index + 1])]
-            if counts[index] < 0.25 * counts.max() or len(floors) >= _MOST_STOREYS:
-                break
-            if all(abs(float(np.median(at)) - floor) >= _STOREY_M for floor in floors):
-                floors.append(float(np.median(at)))
-    floors = sorted(floor for floor in floors if high - floor > _CUT_M) or [low]
+        for index in np.flatnonzero(counts >= _FLOOR_SHARE * counts.max()):
+            floor = float(np.median(heights[(heights >= edges[index]) & (heights < edges[index + 1])]))
+            if not floors or floor - floors[-1] >= _STOREY_M:
+                floors.append(floor)
+    floors = [floor for floor in floors if high - floor > _CUT_M][:_MOST_STOREYS] or [low]
     return list(zip(floors, [*floors[1:], high], strict=True))
 
 

@@ -89,6 +89,7 @@ def test_a_small_hole_is_told_and_a_wide_one_refused(examined):
     assert not examined(room(without=(4, 10)), is_open=True).problems
     hole = found(wide)["holes"]
     assert hole.count == 1
+    assert found(wide)["no closed room"].done == "told"
     pierced = trimesh.Trimesh(*box(), process=False).subdivide().subdivide().subdivide()
     narrow = examined(WrittenNode("room", (Piece(np.asarray(pierced.vertices), np.asarray(pierced.faces[1:]), "x"),)))
     assert not narrow.problems

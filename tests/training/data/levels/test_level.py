@@ -1,4 +1,5 @@
 import importlib.util
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +12,23 @@ from training.data.levels.gltf_writer import Piece, WrittenNode
 from training.data.levels.level import GLTF_AXES, Axes, level_of
 from training.data.levels.level_source import LevelError
 
+ROOT = Path(__file__).parents[4]
+PAGE = ROOT / "docs/how-to/bring-your-own-level.md"
+_ROW = re.compile(r"^\| (\w+)[^|]* \| `--units (\w+) --up (\w)(?: --handedness (\w+))?` \|$", re.MULTILINE)
 ENGINE_AXES = {
-    "unity": Axes(Up.Y, Handedness.LEFT, Units.M),
-    "godot": Axes(Up.Y, Handedness.RIGHT, Units.M),
-    "three": GLTF_AXES,
-    "unreal": Axes(Up.Z, Handedness.LEFT, Units.CM),
+    engine.lower(): Axes(Up(up), Handedness(hand or "right"), Units(units))
+    for engine, units, up, hand in _ROW.findall(PAGE.read_text(encoding="utf-8"))
 }
+"""The table of the page: options for files in an engine's own axes."""
 
 
 def read(path):
     return level_of(path, read_gltf(path), GLTF_AXES)
 
 
-@pytest.mark.parametrize("engine", ENGINE_AXES)
-def test_axes_are_those_of_the_engines_clients(engine):
-    path = Path(__file__).parents[4] / "client_examples/vectors/make.py"
+@pytest.mark.parametrize("engine", ["unity", "godot", "unreal"])
+def test_the_options_of_the_page_are_the_axes_of_the_engines_clients(engine):
+    path = ROOT / "client_examples/vectors/make.py"
     spec = importlib.util.spec_from_file_location("vectors_make", path)
     make = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make)
