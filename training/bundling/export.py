@@ -65,8 +65,9 @@ _INT8_LEAST_WEIGHTS = 100_000
 _TRUNCATION_POSES = 3000
 # Rounding of weights is the only difference. Phases of uncertain bins may change, so frequency is compared where phase
 # is certain. Tolerances are for the largest difference in float32 (float16 weights), and the root mean square in int8.
+# Those of a response are in its standard deviations: half precision of a network of full width errs by 0.003 of them.
 _TOLERANCES: dict[Precision, dict[str, float]] = {
-    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, DIRECTIONS: 0.02, RESPONSE: 1e-3},
+    "float32": {OUTPUTS[0]: 0.05, OUTPUTS[2]: 0.02, OUTPUTS[3]: 0.02, DIRECTIONS: 0.02, RESPONSE: 1e-2},
     "int8": {OUTPUTS[0]: 0.1, OUTPUTS[2]: 0.05, OUTPUTS[3]: 0.05, DIRECTIONS: 0.05, RESPONSE: 0.05},
 }
 _PHASE_TOLERANCE: dict[Precision, float] = {"float32": 0.05, "int8": 0.2}
