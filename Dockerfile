@@ -2,6 +2,19 @@
 #   docker build -t nafir . && docker run --read-only -p 8000:8000 nafir
 ARG BASE=python:3.11-slim
 
+# The library of LLVM that compiles the kernels, for the processor of this machine alone: the one in llvmlite's package can
+# compile for some twenty kinds, and is three times as large. Sources are those of the lock file, LLVM is Debian's.
+FROM ${BASE} AS llvm
+WORKDIR /source
+RUN apt-get update && apt-get install --yes --no-install-recommends llvm-22-dev cmake g++ make zlib1g-dev libzstd-dev
+RUN cd /usr/lib/llvm-22 && target=$(bin/llvm-config --host-target | sed 's/^x86_64.*/X86/; s/^aarch64.*/AArch64/') \
+    && sed -i "s/^set(LLVM_TARGETS_TO_BUILD .*/set(LLVM_TARGETS_TO_BUILD $target)/" lib/cmake/llvm/LLVMConfig.cmake \
+    && sed -i "/^LLVM_[A-Z_]*(/{/($target)/!d}" include/llvm/Config/*.def
+COPY requirements.lock ./
+RUN sed -n '/^llvmlite==/,/[^\\]$/p' requirements.lock > llvmlite.lock \
+    && LLVM_DIR=/usr/lib/llvm-22/lib/cmake/llvm LLVMLITE_LTO=OFF \
+        python3 -m pip wheel --no-deps --no-binary llvmlite --require-hashes --requirement llvmlite.lock --wheel-dir /wheels
+
 FROM ${BASE} AS builder
 WORKDIR /source
 RUN command -v strip || { apt-get update && apt-get install --yes --no-install-recommends binutils; }
@@ -10,14 +23,16 @@ RUN python -m venv --without-pip /opt/nafir
 # Dependencies come before the code, so that a change of code reuses their layer.
 # `make lock` writes the file of exact versions and of digests that each download has to have.
 COPY requirements.lock ./
+COPY --from=llvm /wheels /wheels
 # What no server runs is left out: tests, sources and headers for compilers, symbols for debuggers, ONNX Runtime's tools and
-# its second copy for C. Libraries in `*.libs` were patched by their packagers, and stripping would break them.
+# its second copy for C, and what Pillow has for other files than PNG. Libraries in `*.libs` were patched by their packagers, and stripping would break them.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --require-hashes --requirement requirements.lock \
+    && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --no-deps --force-reinstall /wheels/llvmlite-*.whl \
     && cd /opt/nafir/lib/python3*/site-packages \
     && find . -type d -name tests -prune -exec rm -rf {} + \
     && find . \( -name '*.pyi' -o -name '*.p[xy][dx]' -o -name '*.[ahcf]' -o -name '*.hpp' \) -delete \
     && rm -rf onnxruntime/transformers onnxruntime/tools onnxruntime/quantization onnxruntime/datasets onnxruntime/backend \
-    && rm -f onnxruntime/capi/libonnxruntime.so* \
+    && rm -f onnxruntime/capi/libonnxruntime.so* PIL/_avif.*.so PIL/_webp.*.so PIL/_imagingft.*.so PIL/_imagingcms.*.so \
     && find . -name '*.so*' -not -path './*.libs/*' -exec strip --strip-unneeded {} +
 COPY LICENSE README.md pyproject.toml ./
 COPY server server
@@ -32,24 +47,19 @@ RUN /opt/nafir/bin/python -c "from server.rendering.warm_up import warm_up; warm
         /opt/nafir/bin/python -m server.api.first_start "$scene" || exit 1; \
     done
 
-# The base with the library for streams in Opus, which are refused without it, and without what serves only to install and
-# to read about it.
-FROM ${BASE} AS base
+# The environment, the interpreter, and the libraries of the system that they are linked to: no shell, no package manager.
+# Streams in Opus, which are refused without it, need libopus.
+FROM ${BASE} AS root
 RUN apt-get update && apt-get install --yes --no-install-recommends libopus0
-RUN rm -rf /usr/share/doc /usr/share/man /usr/share/info /usr/share/locale /usr/share/perl* /usr/share/bash-completion /usr/share/python-wheels \
-        /usr/lib/*/perl* /usr/lib/*/gconv /usr/lib/apt /usr/bin/perl* /var/cache /var/lib/apt /var/log \
-    && for library in /usr/lib/python3* /usr/local/lib/python3*; do \
-        cd "$library" 2>/dev/null \
-        && rm -rf test idlelib lib2to3 ensurepip tkinter turtledemo pydoc_data site-packages/pip* dist-packages/pip* dist-packages/setuptools*; \
-    done; \
-    find / -xdev -name __pycache__ -type d -prune -exec rm -rf {} +
+COPY --from=builder /opt/nafir /opt/nafir
+COPY deploy/container/root.py /
+RUN python3 /root.py /image /opt/nafir
 
 FROM scratch
 LABEL org.opencontainers.image.title="Nafir" \
       org.opencontainers.image.description="A real-time neural acoustic field renderer" \
       org.opencontainers.image.licenses="MIT"
-COPY --from=base / /
-COPY --from=builder /opt/nafir /opt/nafir
+COPY --from=root /image /
 ENV PATH=/opt/nafir/bin:/usr/local/bin:/usr/bin:/bin \
     LANG=C.UTF-8 \
     PYTHONDONTWRITEBYTECODE=1 \

@@ -1,17 +1,18 @@
 #!/usr/bin/env bash
 # Builds the container image and tries it as an operator would, where no Docker engine runs.
 #
-#   sudo apt-get install buildah podman runc mmdebstrap curl
+#   sudo apt-get install buildah podman runc mmdebstrap curl caddy
 #   sudo make container-test
 #
 # The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
 # Debian with its Python 3.13 (the 3.11 of the release before is too old for requirements.lock), in an image store of this
 # script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
 # for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
-# through the scene over WebSocket.
+# through the scene over WebSocket. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy, and a client listens
+# through wss.
 #
 # Environment, all optional:
-#   PORT=8000            port on the host's loopback
+#   PORT=8000            port on the host's loopback; TLS_PORT=8443 that of Caddy, if it is installed
 #   SCENE=apartment      scene to ask for
 #   QUERY=...            query of the impulse-response request
 #   CONTEXT=.            folder with the Dockerfile
@@ -28,6 +29,7 @@ base=${BASE_IMAGE:-python:3.13-slim}
 image=nafir:container-test
 container=nafir-container-test
 port=${PORT:-8000}
+tls_port=${TLS_PORT:-8443}
 scene=${SCENE:-apartment}
 query=${QUERY:-listener=1,2,1.5&emitter=6,3,1.5&yaw_deg=90}
 url=http://127.0.0.1:$port
@@ -49,7 +51,11 @@ state=$(cd "$state" && pwd)
 store=(--root "$state/images" --runroot "$state/run")
 run_podman() { podman "${store[@]}" --runtime "$(command -v runc)" --cgroup-manager cgroupfs "$@"; }
 
+caddy=
+ulimits=(--ulimit nofile=1024:1024 --ulimit nproc=4096:4096)
+unpack='import sys, tarfile; tarfile.open(fileobj=sys.stdin.buffer, mode="r|").extractall("/dev/shm", filter="data")'
 tear_down() {
+    [ -z "$caddy" ] || kill "$caddy" 2>/dev/null || true
     run_podman rm --force --ignore "$container" >/dev/null 2>&1 || true
     if [ -z "$keep" ]; then
         run_podman rmi --all --force >/dev/null 2>&1 || true
@@ -97,20 +103,33 @@ case $(run_podman image inspect "$image" --format '{{.User}}') in
 esac
 [ "$(run_podman image inspect "$image" --format '{{if .HealthCheck}}yes{{end}}')" = yes ] || fail "the image has no health check"
 
-say "running it read-only"
-started=$SECONDS
 # The health check is run below: podman would have systemd time it.
-run_podman run --detach --name "$container" --no-healthcheck --network host --read-only --read-only-tmpfs=false \
-    --cap-drop all --security-opt no-new-privileges \
-    --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 \
-    --env NAFIR_HOST=127.0.0.1 --env "NAFIR_PORT=$port" --env NAFIR_MAX_CONNECTIONS=512 "$image" >/dev/null
-until curl --silent --fail --output /dev/null "$url/readyz"; do
-    [ "$(run_podman inspect "$container" --format '{{.State.Running}}')" = true ] ||
-        { run_podman logs "$container"; fail "the server stopped"; }
-    ((SECONDS - started < 120)) || { run_podman logs "$container"; fail "not ready after 120 s"; }
-    sleep 0.5
-done
-echo "ready in $((SECONDS - started)) s"
+start_server() {
+    started=$SECONDS
+    run_podman run --detach --name "$container" --no-healthcheck --network host --read-only --read-only-tmpfs=false \
+        --cap-drop all --security-opt no-new-privileges \
+        "${ulimits[@]}" \
+        --env NAFIR_HOST=127.0.0.1 --env "NAFIR_PORT=$port" --env NAFIR_MAX_CONNECTIONS=512 "$@" "$image" >/dev/null
+    until curl --silent --fail --output /dev/null "$url/readyz"; do
+        [ "$(run_podman inspect "$container" --format '{{.State.Running}}')" = true ] ||
+            { run_podman logs "$container"; fail "the server stopped"; }
+        ((SECONDS - started < 240)) || { run_podman logs "$container"; fail "not ready after 240 s"; }
+        sleep 0.5
+    done
+    echo "ready in $((SECONDS - started)) s"
+}
+stop_server() {
+    say "stopping it"
+    started=$SECONDS
+    run_podman stop --time 10 "$container" >/dev/null
+    code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
+    echo "stopped in $((SECONDS - started)) s with exit code $code"
+    [ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
+    run_podman rm "$container" >/dev/null
+}
+
+say "running it read-only"
+start_server
 
 run_podman exec "$container" python -c '
 import importlib.util, os
@@ -155,15 +174,60 @@ PYTHON
 say "walking through the scene for three seconds"
 # From inside, where what the client imports is installed; /dev/shm is the only place to write.
 tar --create --directory "$root/client_examples/python" nafir_client walk.py |
-    run_podman exec --interactive "$container" python -c \
-        'import sys, tarfile; tarfile.open(fileobj=sys.stdin.buffer, mode="r|").extractall("/dev/shm", filter="data")'
+    run_podman exec --interactive "$container" python -c "$unpack"
 run_podman exec "$container" python /dev/shm/walk.py --url "ws://127.0.0.1:$port" --scene "$scene" \
     --seconds 3 -o /dev/shm/heard.wav
 
-say "stopping it"
-started=$SECONDS
-run_podman stop --time 10 "$container" >/dev/null
-code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
-echo "stopped in $((SECONDS - started)) s with exit code $code"
-[ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
+stop_server
+
+# As deploy/compose.yaml runs it: keys, a folder for the cache, and Caddy with TLS in front. The networks of compose take a
+# plug-in and rights that such a machine often has not, so both stand on the host's; Caddy is the host's program.
+if command -v caddy >/dev/null; then
+    say "running it behind TLS, with keys"
+    mkdir -p "$state/secrets" "$state/cache"
+    rm -f "$state/secrets/keys.json"
+    nafir_keys() { run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$state/secrets:/secrets" --user 0 "$image" keys "$@"; }
+    key=$(nafir_keys create --file /secrets/keys.json --scope listen --scope render)
+    metrics_key=$(nafir_keys create --file /secrets/keys.json --scope metrics)
+    chmod 644 "$state/secrets/keys.json"
+    chmod 777 "$state/cache"
+    start_server --tmpfs /tmp --user 10001:10001 --volume "$state/cache:/cache" --env NUMBA_CACHE_DIR=/cache \
+        --volume "$state/secrets/keys.json:/run/secrets/keys:ro" --env NAFIR_KEYS_FILE=/run/secrets/keys \
+        --env NAFIR_REQUIRE_AUTH=true --env NAFIR_ALLOWED_HOSTS=localhost --env NAFIR_DRAIN_S=8 \
+        --env NAFIR_MAX_CONNECTIONS_PER_ADDRESS=1024
+    tls=https://localhost:$tls_port
+    HOME=$state XDG_DATA_HOME=$state/caddy XDG_CONFIG_HOME=$state/caddy DOMAIN=$tls UPSTREAM=127.0.0.1:$port \
+        caddy run --adapter caddyfile --config "$root/deploy/Caddyfile" 2>"$state/caddy.log" &
+    caddy=$!
+    authority=$state/caddy/caddy/pki/authorities/local/root.crt
+    until curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
+        kill -0 "$caddy" 2>/dev/null || { tail -5 "$state/caddy.log"; fail "Caddy stopped"; }
+        ((SECONDS - started < 180)) || { tail -5 "$state/caddy.log"; fail "not ready behind TLS after 180 s"; }
+        sleep 0.5
+    done
+    status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
+    [ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
+    [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ] || fail "a key opens nothing"
+    [ "$(status -H "Authorization: Bearer $metrics_key" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
+    [ "$(status -H "Authorization: Bearer $metrics_key" "$url/metrics")" = 200 ] || fail "Prometheus' key opens no metrics"
+    run_podman exec --interactive "$container" sh -c true 2>/dev/null && fail "the image has a shell"
+    tar --create --directory "$root/client_examples/python" nafir_client --directory "$(dirname "$authority")" root.crt |
+        run_podman exec --interactive "$container" python -c "$unpack"
+    run_podman exec --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/dev/shm/root.crt --workdir /dev/shm "$container" python -c \
+        'from nafir_client.command_line import main; main()' listen "wss://localhost:$tls_port" --scene "$scene" \
+        --seconds 3 --silent --output heard.wav
+    run_podman exec --workdir /dev/shm "$container" python -c '
+import soundfile
+samples, rate = soundfile.read("heard.wav")
+peak = abs(samples).max()
+print(f"{len(samples) / rate:.2f} s heard through wss, peak {peak:.4f}")
+assert len(samples) > 2 * rate and 0.001 < peak <= 1, "silence"
+'
+    kill "$caddy"
+    wait "$caddy" || true
+    caddy=
+    stop_server
+else
+    say "Caddy is not installed: not tried behind TLS"
+fi
 say "container test passed"

@@ -1,0 +1,104 @@
+"""Copies what a Python environment needs to run into an empty folder: `python root.py FOLDER ENVIRONMENT`.
+
+That is the environment, the interpreter with its standard library, and every shared library that one of their files is
+linked to, of the system's and of those that packages bring in folders named `*.libs`. What is left is the root of an
+image without a shell, a package manager or a compiler.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+OPENED = ("libopus.so.0",)
+"""Libraries that are opened by name while the server runs."""
+LEFT_OUT = (
+    *("test", "idlelib", "lib2to3", "ensurepip", "tkinter", "turtledemo", "pydoc_data", "site-packages"),
+    *("dist-packages", "__pycache__", "config-*", "*.a", "LICENSE.txt"),
+)
+"""What of the standard library no server imports."""
+SETTINGS = (
+    *("etc/passwd", "etc/group", "etc/nsswitch.conf", "etc/ssl/certs/ca-certificates.crt", "etc/ssl/openssl.cnf"),
+    *("etc/os-release", "usr/lib/os-release", "etc/debian_version"),
+)
+"""Files of the system that libraries, or scanners of images, read."""
+EMPTY = "dev", "proc", "run", "sys", "tmp", "var/tmp"
+
+
+def copy(root: Path, file: Path) -> None:
+    """Copy a file with every link on the way to it, and each folder that is a link, as Debian's /lib."""
+    for folder in reversed(file.parents[:-1]):
+        inside = root / folder.relative_to("/")
+        if folder.is_symlink():
+            if not inside.is_symlink():
+                inside.parent.mkdir(parents=True, exist_ok=True)
+                inside.symlink_to(folder.readlink())
+            copy(root, folder.resolve() / file.relative_to(folder))
+            return
+    target = root / file.relative_to("/")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists() and not target.is_symlink():
+        shutil.copy2(file, target, follow_symlinks=False)
+    if file.is_symlink():
+        copy(root, file.parent / file.readlink())
+
+
+def linked(files: Iterable[Path]) -> Iterator[Path]:
+    """The libraries of the system that files are linked to, of all that are found."""
+    listed = subprocess.run(["ldd", *map(str, files)], capture_output=True, text=True, check=False).stdout
+    for line in listed.splitlines():
+        words = line.split()
+        found = words[2] if words[1:2] == ["=>"] and len(words) > 2 else words[0] if words else ""
+        if found.startswith("/") and not found.endswith(":"):
+            yield Path(os.path.normpath(found))  # packages name their own by "..", and links are kept
+
+
+def shared(root: Path) -> list[Path]:
+    return [each for each in root.rglob("*.so*") if each.is_file()]
+
+
+def is_bundled(file: Path) -> bool:
+    """Whether a library came with a package that links to it, or did so before parts of it were left out."""
+    return file.parent.name.endswith(".libs")
+
+
+def opened() -> Iterator[Path]:
+    """The libraries of `OPENED`. Raises FileNotFoundError for one that there is not."""
+    known = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=True).stdout
+    for name in OPENED:
+        found = [line.split()[-1] for line in known.splitlines() if line.split()[:1] == [name]]
+        if not found:
+            raise FileNotFoundError(name)
+        yield Path(found[0])
+
+
+def main(root: Path, environment: Path) -> None:
+    library = Path(sysconfig.get_path("stdlib"))
+    ignored = shutil.ignore_patterns(*LEFT_OUT)
+    shutil.copytree(library, root / library.relative_to("/"), symlinks=True, ignore=ignored)
+    shutil.copytree(environment, root / environment.relative_to("/"), symlinks=True)
+    interpreter = Path(sys.base_prefix) / "bin" / Path(sys.executable).name
+    programs = [interpreter.resolve(), *(each for each in shared(root) if not is_bundled(each))]
+    found = [interpreter, *opened(), *linked([*programs, *opened()])]
+    for each in shared(root):
+        if is_bundled(each) and each not in found:
+            each.unlink()
+    for file in dict.fromkeys(found):
+        if not file.is_relative_to(environment) and not file.is_relative_to(root):
+            copy(root, file)
+    for link in (environment / "bin").iterdir():  # the environment's interpreters are links to the system's
+        if link.is_symlink() and link.readlink().is_absolute():
+            copy(root, link.readlink())
+    for name in SETTINGS:
+        if Path("/", name).exists():
+            copy(root, Path("/", name))
+    for name in EMPTY:
+        (root / name).mkdir(parents=True, exist_ok=True)
+        (root / name).chmod(0o1777 if name.endswith("tmp") else 0o755)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
