@@ -78,7 +78,7 @@ export class Frontier extends EventTarget {
       return option;
     });
     const here = this.#offersHere ? [new Option(this.#titleHere, HERE)] : [];
-    this.#choice.replaceChildren(new Option("Automatic", "auto"), ...options, ...here);
+    this.#choice.replaceChildren(new Option("Automatic", "auto"), ...here, ...options);
     this.#choice.value = [...this.#choice.options].some(({ value }) => value === chosen) ? chosen : "auto";
     this.#choice.disabled = false;
     this.#draw();

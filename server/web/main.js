@@ -31,6 +31,7 @@ const DRY = { early_reflections: false, late_reverberation: false };
 const AS_PLANNED = { early_reflections: null, late_reverberation: null };
 const ORDER = 1; // of ambisonic streams
 const NO_FIELD = "none";
+const SETTLED_MS = 300; // a choice is made for so long before another stream begins: keys pass through levels on their way
 const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
@@ -385,13 +386,17 @@ class Page {
 
   async #useLevel(name) {
     if (this.#isHere || name === HERE) {
-      if (this.#isHere === (name === HERE)) return;
+      await pause(SETTLED_MS);
+      if (this.frontier.chosen !== name) return; // another was chosen meanwhile
+    }
+    if (this.#isHere !== (name === HERE)) {
       const wasPlaying = this.playing;
       await this.pause();
       this.#chooseStream();
       if (wasPlaying) await this.play();
       return;
     }
+    if (this.#isHere) return;
     this.turning.level = name;
     if (!this.#renewed({ level: name })) this.#tell("level", { name });
   }

@@ -24,6 +24,8 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   radio.position = [1, 2];
   // @ts-expect-error  an emitter has a position
   nafir.addEmitter({ clip: "trumpet" });
+  // @ts-expect-error  a scene is rendered here or by the server
+  await connect(context, "", { scene: "apartment", rendered: "there" });
   // @ts-expect-error  ambisonics end at order 3
   await connect(context, "", { scene: "apartment", order: 4 });
   return nafir.latency.direct;

@@ -54,10 +54,10 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     assert measured.get_attribute("data-level") == "near"
     assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
     options = page.locator("#level-choice option").all()
-    plain = ["Automatic", "Full, fine", "Full, standard", "At most 20 responses a second", "In this browser"]
+    plain = ["Automatic", "In this browser", "Full, fine", "Full, standard", "At most 20 responses a second"]
     shown = [option.inner_text() for option in options]
     assert [re.sub(", [^ ]+ ms$", "", text) for text in shown] == plain
-    assert [option.get_attribute("title") for option in options] == [None, "fine", "standard", "quick", None]
+    assert [option.get_attribute("title") for option in options] == [None, None, "fine", "standard", "quick"]
     titles = page.locator("#frontier title").all_text_contents()
     assert any(title.startswith("At most 20 responses a second (quick): error") for title in titles)
 

@@ -4,11 +4,13 @@
 import { apiOf, fetchBytes } from "../http.js";
 import { WorkerStream } from "../worker_stream.js";
 
+const RETRY_MS = 5000; // after which a clip that could not be had is asked for again
+
 export class LocalWorkerStream extends WorkerStream {
   #server = null;
   #key = null;
   #sampleRate = 0;
-  #clips = new Set(); // asked for
+  #clips = new Map(); // those asked for: name -> when to ask again
 
   constructor(worker = new Worker(new URL("./stream_worker.js", import.meta.url), { type: "module" })) {
     super(worker);
@@ -30,15 +32,15 @@ export class LocalWorkerStream extends WorkerStream {
   }
 
   async #fetch({ clip }) {
-    if (clip === undefined || this.#server === null || this.#clips.has(clip)) return;
-    this.#clips.add(clip);
+    if (clip === undefined || this.#server === null || performance.now() < (this.#clips.get(clip) ?? 0)) return;
+    this.#clips.set(clip, Infinity);
     const sampleRate = this.#sampleRate;
     try {
       const bytes = await fetchBytes(new URL(`clips/${encodeURIComponent(clip)}/audio`, this.#server), { key: this.#key });
       const decoded = await new OfflineAudioContext(1, 1, sampleRate).decodeAudioData(bytes.buffer);
       if (sampleRate === this.#sampleRate) super.tell("sound", { name: clip, samples: meanOf(decoded) });
     } catch (error) {
-      this.#clips.delete(clip); // so that it is tried again
+      this.#clips.set(clip, performance.now() + RETRY_MS);
       const detail = { code: error.code ?? "unplayable_clip", message: `${clip} cannot be played here: ${error.message}`, field: "clip" };
       this.dispatchEvent(new CustomEvent("refused", { detail }));
     }

@@ -1,6 +1,5 @@
 // One emitter's sound as first-order ambisonic channels (W, Y, Z, X in world axes): the direct sound by a delay line, which glides as its
-// path does, and the room's answer by convolution in partitions of one quantum. It does no I/O and allocates nothing while it renders, so
-// that a worklet and tests can drive it.
+// path does, and the room's answer by convolution in partitions of one quantum. It does no I/O, so that a worker and tests can drive it.
 
 import { inverse, transform } from "./fourier.js";
 import { BEFORE, PHASES, SINC_TAPS, sincTable } from "./plane_waves.js";
