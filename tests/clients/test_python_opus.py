@@ -9,10 +9,11 @@ import pytest
 import nafir_client
 from nafir_client import MissingLibraryError, ProtocolError, opus, wire
 from nafir_client.session import Session
-from server.protocol.blocks import AudioBlock
+from server.assets.clips import ClipLibrary
+from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.codecs import libopus
 from server.protocol.opus import OpusOptions
-from server.protocol.packets import BlockEncoder
+from server.protocol.packets import BlockEncoder, LiveDecoders
 from tests.clients.test_python_wire import WELCOME
 
 needs_opus = pytest.mark.skipif(not libopus.is_available(), reason="libopus is not installed (apt install libopus0)")
@@ -71,6 +72,34 @@ def test_after_skipped_blocks_the_sound_goes_on_at_its_clock():
     last = blocks[-1]
     error = last.samples.T - samples[:, last.sample_clock : last.sample_clock + last.frames]
     assert 10 * np.log10(np.mean(error**2) / np.mean(samples**2)) < -20
+
+
+@needs_opus
+def test_live_sound_goes_up_in_opus():
+    """What the server decodes is what was written, behind by the encoder's look-ahead of 2.5 ms."""
+    samples = ClipLibrary(RATE).load("woman-reading").samples[: 2 * RATE]
+    session = Session("flat", {"encoding": "opus", "opus": {"bitrate": 256_000}})
+    session.first_message()
+    session.greet(sent(tones(2, 256))[0], 0.0)
+    live = session.live_input(4, 2.0)
+    emitter = session.add_emitter({"id": "voice", "live": True, "position": (2.0, 2.5, 1.5)}, live)
+    session.outbox.take()
+    emitter.is_heard = True
+    live.open()
+    decoders, heard, size = LiveDecoders(RATE, 1), [], 0
+    for start in range(0, len(samples), 100):  # as a microphone gives them
+        live.write(samples[start : start + 100])
+        session.pump()
+        while (data := session.outbox.take()) is not None:
+            size += len(data)
+            heard.append(decoders.decode(DryBlock.parse(data)).samples)
+        live.advance(100)
+    decoded = np.concatenate(heard)
+    lag = RATE // 400
+    error = decoded[lag:] - samples[: len(decoded) - lag]
+    assert len(decoded) > len(samples) - RATE // 100 - 4 * 256
+    assert 10 * np.log10(np.mean(samples**2) / np.mean(error**2)) > 30
+    assert size / len(decoded) < 4 / 5
 
 
 @needs_opus

@@ -15,7 +15,7 @@ from server.acoustics.geometry import Quaternion
 from server.api.settings import Settings
 from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, parse_client_message
-from server.protocol.codecs.registry import CODECS
+from server.protocol.codecs.registry import CODECS, NUMBERS
 from server.scene.effects import EffectName
 
 FLAGS = {"is_exchange": wire.EXCHANGE, "is_late": wire.LATE, "is_limited": wire.LIMITED}
@@ -40,6 +40,7 @@ def test_constants_of_the_wire_are_those_of_the_server():
     assert (wire.BLOCK_KIND, wire.POSE_KIND, wire.DRY_KIND) == (AudioBlock.KIND, ListenerPose.KIND, DryBlock.KIND)
     assert FLAGS.items() <= AudioBlock.FLAGS.items()
     assert tuple(CODECS)[: len(wire.ENCODINGS)] == wire.ENCODINGS
+    assert NUMBERS["opus"] == wire.OPUS_NUMBER
     assert tuple(EffectName) == wire.EFFECTS
 
 

@@ -8,6 +8,7 @@ from collections import deque
 
 import numpy as np
 
+from nafir_client.opus import OpusWriter
 from nafir_client.wire import Samples
 
 
@@ -15,10 +16,12 @@ class LiveInput:
     """Takes samples in chunks of any size, and gives blocks that are due. Lengths are in samples.
 
     `ahead` is how much should wait at the server. Beyond `longest`, the oldest samples that wait here are dropped.
+    With a `writer` they go as packets, which are as long as its frames.
     """
 
-    def __init__(self, block_size: int, *, ahead: int, longest: int) -> None:
-        self._block_size = block_size
+    def __init__(self, block_size: int, *, ahead: int, longest: int, writer: OpusWriter | None = None) -> None:
+        self.writer = writer
+        self._block_size = block_size if writer is None else writer.frame_samples
         self._ahead = ahead
         self._longest = longest
         self._chunks: deque[Samples] = deque()
@@ -54,10 +57,12 @@ class LiveInput:
         self._at_server = max(self._at_server, samples_queued)
 
     def due(self) -> list[Samples]:
-        """The blocks to send now. They are whole, unless the server is about to run out: then what there is goes."""
+        """The blocks to send now. They are whole, unless the server is about to run out: then what there is goes, if it
+        need not be a packet."""
         blocks = []
         while self._is_open and self.waiting and self._at_server < self._ahead:
-            if self.waiting < self._block_size and self._at_server >= self._ahead / 2:
+            is_whole = self.waiting >= self._block_size
+            if not is_whole and (self.writer is not None or self._at_server >= self._ahead / 2):
                 break
             block = self._take(min(self._block_size, self.waiting))
             self._at_server += len(block)

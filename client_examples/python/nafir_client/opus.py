@@ -1,4 +1,4 @@
-"""Blocks in Opus (RFC 6716), by the system's libopus.
+"""Blocks in Opus (RFC 6716) and live sound on its way up, by the system's libopus.
 
 A block holds the packets that its samples have completed, for one or several streams of one or two channels. After a
 restart decoders begin anew, and the first `look_ahead` samples that they give are no part of the sound.
@@ -7,6 +7,7 @@ restart decoders begin anew, and the first `look_ahead` samples that they give a
 import ctypes
 import struct
 import sys
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, Final
 
@@ -23,6 +24,11 @@ _NAMES: Final = {
 _LENGTH: Final = struct.Struct("<H")
 _LONGEST_PACKET_S: Final = 0.12
 _RESET_STATE: Final = 4028
+_SET_BITRATE, _SET_COMPLEXITY, _SET_SIGNAL = 4002, 4010, 4024
+_APPLICATIONS: Final = {"voip": 2048, "audio": 2049, "low_delay": 2051}
+_SIGNALS: Final = {"auto": -1000, "voice": 3001, "music": 3002}
+_LONGEST_PACKET_BYTES: Final = 1276
+"""Of one frame: RFC 6716, section 3.4."""
 
 
 @cache
@@ -38,6 +44,9 @@ def _library() -> Any:
         pointer, number, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_int32
         library.opus_decoder_init.argtypes = (pointer, size, number)
         library.opus_decode_float.argtypes = (pointer, ctypes.c_char_p, size, pointer, number, number)
+        library.opus_encoder_ctl.argtypes = (pointer, number)
+        library.opus_encoder_init.argtypes = (pointer, size, number, number)
+        library.opus_encode_float.argtypes = (pointer, pointer, number, pointer, size)
         return library
     problem = "encoding: opus needs libopus, which is not there: apt-get install libopus0, or brew install opus"
     raise MissingLibraryError(problem)
@@ -68,6 +77,37 @@ class _Decoder:
         if frames < 0:
             raise ProtocolError(f"a packet of {len(packet)} bytes is not Opus")
         return room[:frames].copy()
+
+
+class OpusWriter:
+    """Encodes the sound of a live emitter as the server does a single channel: with half the `bitrate` of the stream's
+    options, which are those of a hello. A packet has `frame_samples`."""
+
+    def __init__(self, sample_rate: int, frame_samples: int, options: Mapping[str, Any]) -> None:
+        self.frame_samples = frame_samples
+        self._library = library = _library()
+        self._state = ctypes.create_string_buffer(library.opus_encoder_get_size(1))
+        self._packet = ctypes.create_string_buffer(_LONGEST_PACKET_BYTES)
+        kind = _APPLICATIONS[options.get("application", "low_delay")]
+        if library.opus_encoder_init(self._state, sample_rate, 1, kind) < 0:
+            raise ProtocolError(f"there is no Opus at {sample_rate} Hz")
+        settings = {
+            _SET_BITRATE: options.get("bitrate", 128_000) // 2,
+            _SET_COMPLEXITY: options.get("complexity", 5),
+            _SET_SIGNAL: _SIGNALS[options.get("signal", "auto")],
+        }
+        for request, value in settings.items():
+            library.opus_encoder_ctl(self._state, request, ctypes.c_int32(value))
+
+    def write(self, samples: Samples) -> bytes:
+        """The packet of the next samples (frame_samples,). Those that are no numbers become silence."""
+        frame = np.clip(np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0), -1.0, 1.0).astype(np.float32)
+        size = self._library.opus_encode_float(
+            self._state, frame.ctypes.data, len(frame), self._packet, _LONGEST_PACKET_BYTES
+        )
+        if size < 0:
+            raise ProtocolError(f"a frame of {len(frame)} samples cannot be Opus")
+        return self._packet.raw[:size]
 
 
 class OpusReader:

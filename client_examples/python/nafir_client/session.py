@@ -12,7 +12,7 @@ from typing import Any, Literal, TypedDict
 
 from nafir_client.errors import ProtocolError, RefusedError
 from nafir_client.live_input import LiveInput
-from nafir_client.opus import OpusReader, require_opus
+from nafir_client.opus import OpusReader, OpusWriter, require_opus
 from nafir_client.outbox import Outbox, Outgoing
 from nafir_client.pose import Orientation, Pose, Position
 from nafir_client.scene import Welcome
@@ -25,6 +25,7 @@ from nafir_client.wire import (
     SampleEncoding,
     Samples,
     dry_bytes,
+    dry_packet_bytes,
     parse_block,
     parse_packets,
     pose_bytes,
@@ -230,6 +231,18 @@ class Session:
                 raise ProtocolError(f"a {message['type']} of the server cannot be read: {exc!r}") from exc
         return self._receive_block(data, now_s) if data[:1] == bytes([BLOCK_KIND]) else None
 
+    def live_input(self, ahead_blocks: int, longest_s: float) -> LiveInput:
+        """That of a live emitter to be added, which keeps some blocks ahead and holds back so many seconds at most."""
+        welcome = self.welcome
+        assert welcome is not None
+        writer = None
+        if welcome.encoding == "opus":
+            frame_samples = welcome.given["opus"]["frame_samples"]
+            writer = OpusWriter(welcome.sample_rate, frame_samples, self._hello.get("opus") or {})
+        ahead = ahead_blocks * welcome.block_size
+        longest = ahead + round(longest_s * welcome.sample_rate)
+        return LiveInput(welcome.block_size, ahead=ahead, longest=longest, writer=writer)
+
     def move_listener(self, pose: Pose, now_s: float) -> int:
         """Returns the pose id, which blocks name once they are heard from there."""
         self.listener = pose
@@ -303,9 +316,12 @@ class Session:
                     self._put_dry(emitter, emitter.live, samples)
 
     def _put_dry(self, emitter: SessionEmitter, live: LiveInput, samples: Samples) -> None:
-        # Of the encodings without frames of their own, the shorter one where bandwidth matters.
         encoding: SampleEncoding = "f32" if self._hello["encoding"] == "f32" else "s16"
-        self.outbox.put(Outgoing(dry_bytes(emitter.id, live.sequence, samples, encoding)))
+        if live.writer is None:
+            data = dry_bytes(emitter.id, live.sequence, samples, encoding)
+        else:
+            data = dry_packet_bytes(emitter.id, live.sequence, live.writer.frame_samples, live.writer.write(samples))
+        self.outbox.put(Outgoing(data))
         live.sequence += 1
 
     def _added(self, emitter: SessionEmitter) -> Outgoing:

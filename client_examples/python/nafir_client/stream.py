@@ -359,9 +359,7 @@ class Stream:
         if clip is not None:
             fields.update({name: options[name] for name in _OF_CLIPS if name in options})
             return {"loop": True, **fields, "clip": clip}, None
-        ahead = options.get("ahead_blocks", 4) * self.block_size
-        live = LiveInput(self.block_size, ahead=ahead, longest=ahead + round(_LIVE_S * self.sample_rate))
-        return {**fields, "live": True}, live
+        return {**fields, "live": True}, self._session.live_input(options.get("ahead_blocks", 4), _LIVE_S)
 
     def _free_id(self) -> str:
         return next(name for number in self._numbers if (name := f"emitter-{number}") not in self._session.emitters)

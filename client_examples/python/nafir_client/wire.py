@@ -29,7 +29,9 @@ DRY: Final = struct.Struct("<BBHII")
 EXCHANGE, LATE, LIMITED, RESTART = 1, 2, 4, 8
 """Flags of an audio block."""
 ENCODINGS: Final = ("f32", "s16")
-"""In the order of their numbers in dry blocks."""
+"""Those of single samples, in the order of their numbers in dry blocks."""
+OPUS_NUMBER: Final = 2
+"""That of Opus there."""
 EFFECTS: Final = (
     "direct_path",
     "distance_attenuation",
@@ -128,11 +130,20 @@ def pose_bytes(pose: Pose, pose_id: int) -> bytes:
 
 def dry_bytes(emitter: str, sequence: int, samples: Samples, encoding: SampleEncoding) -> bytes:
     """The next samples (n,) of a live emitter, n at least 1. Samples that are no numbers become silence."""
-    identifier = emitter.encode()
-    header = DRY.pack(DRY_KIND, ENCODINGS.index(encoding), len(identifier), sequence, len(samples))
     samples = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0)
     if encoding == "s16":
         body = np.rint(np.clip(samples, -1, 1) * _FULL_SCALE).astype("<i2").tobytes()
     else:
         body = samples.astype("<f4").tobytes()
-    return header + identifier + bytes(-len(identifier) % 4) + body
+    return _dry_header(emitter, sequence, len(samples), ENCODINGS.index(encoding)) + body
+
+
+def dry_packet_bytes(emitter: str, sequence: int, frames: int, packet: bytes) -> bytes:
+    """The next samples of a live emitter as a packet of Opus that decodes to so many frames."""
+    return _dry_header(emitter, sequence, frames, OPUS_NUMBER) + len(packet).to_bytes(2, "little") + packet
+
+
+def _dry_header(emitter: str, sequence: int, frames: int, encoding: int) -> bytes:
+    identifier = emitter.encode()
+    header = DRY.pack(DRY_KIND, encoding, len(identifier), sequence, frames)
+    return header + identifier + bytes(-len(identifier) % 4)
