@@ -110,7 +110,7 @@ def _costs_told(address: str) -> str | None:
     """What a plan's costs are known by, of the scene that is measured last. Until the server has measured them beside
     its streams, a question has them measured once, a little differently."""
     path = f"/v1/scenes/{bundled_scenes()[-1].name}/plan?emitter=6,3,1.5"
-    with urllib.request.urlopen(f"http://{address}{path}", timeout=60) as answer:
+    with urllib.request.urlopen(f"http://{address}{path}", timeout=_MEASURED_S) as answer:  # it may be compiled first
         return answer.headers["ETag"]
 
 
