@@ -21,10 +21,12 @@ from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
     PROTOCOL,
     AddEmitter,
+    AddListener,
     Hello,
     ListenerPose,
     Ping,
     RemoveEmitter,
+    RemoveListener,
     Resume,
     TextMessage,
 )
@@ -32,7 +34,16 @@ from server.protocol.codecs.registry import CODECS, OPUS_MEANING
 from server.protocol.codes import ACCESS_ENDED, CLOSE_CODES, ERROR_CODES, TAKEN_OVER
 from server.protocol.exchange import EXCHANGE
 from server.protocol.message import Message
-from server.protocol.server_messages import EmitterAdded, EmitterRemoved, Error, Pong, ServerMessage, Welcome
+from server.protocol.server_messages import (
+    EmitterAdded,
+    EmitterRemoved,
+    Error,
+    ListenerAdded,
+    ListenerRemoved,
+    Pong,
+    ServerMessage,
+    Welcome,
+)
 from server.streaming.stream import PAUSE_AFTER_S
 
 Object = dict[str, Any]
@@ -45,6 +56,8 @@ _ANSWERS: Final[dict[type[Message], type[Message]]] = {
     Resume: Welcome,
     AddEmitter: EmitterAdded,
     RemoveEmitter: EmitterRemoved,
+    AddListener: ListenerAdded,
+    RemoveListener: ListenerRemoved,
     Ping: Pong,
 }
 _CLIENT_BINARY: Final[dict[str, _Binary]] = {"listener_binary": ListenerPose, DryBlock.type: DryBlock}
@@ -90,6 +103,17 @@ Without one it is refused with 401 or 403 and a problem document. A stream ends 
 start of the stream, sent or skipped. A message with a `sample_clock` takes effect in the block that begins there. Pose
 0 is where the listener starts. Later poses, of the listener and of emitters, have rising ids. Each block names the
 newest pose of its direct sound and that of its reflected field, so that a client can measure both latencies.
+
+**Several listeners.** A stream begins with one listener, who has no id and the number 0. `add_listener` adds others, up
+to {_default("max_listeners")} in all: players at a split screen, or spectators. All hear the same emitters at the same
+`sample_clock`; each has a pose, a head, blocks, effects and statistics of its own. Blocks carry the listener's number
+in their headers, so a client that adds none gets the bytes it always got. Poses name a listener by its id or, in
+binary, by its number. Each listener has a `sequence` and a window of its own, so `acknowledge` names it too; messages
+about it carry its id as `listener`. Output, encoding, sample rate, block size, level and switched effects are those of
+the stream. An emitter that is added while there are several listeners begins for all with the same block. A pose of a
+listener has to be newer than its own and than those of emitters; one of an emitter newer than all. A `listeners` in the
+`hello` keeps room for them, and the `welcome` then has `max_listeners`. A listener that would break somebody's sound is
+refused (`server_busy`). A resumed stream has its listeners again (`resumed.listeners`), all from the same `sequence`.
 
 **Ambisonics.** With `"output": "ambisonics"` in the `hello`, blocks have the channels of AmbiX (ACN order, SN3D norm)
 of the `order` in the `hello`: 4, 9 or 16, as `welcome` says. They are in the axes of the scene, at the place of the
@@ -253,7 +277,7 @@ def describe() -> Object:
         "channels": {
             "stream": {
                 "address": "/v1/stream",
-                "title": "One listener in one scene",
+                "title": "Listeners in one scene",
                 "description": f"The connection is closed with\n\n{_listed(CLOSE_CODES)}",
                 "messages": {name: {"$ref": f"#/components/messages/{name}"} for name in messages},
                 "bindings": {"ws": {"method": "GET", "bindingVersion": "0.1.0"}},

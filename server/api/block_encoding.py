@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from server.protocol.packets import BlockEncoder
+from server.protocol.server_messages import ListenerRemoved
 from server.runtime.thread_pool import ThreadPool
 from server.streaming.stream import Outgoing, StreamFailed, TimedBlock
 
@@ -19,8 +20,9 @@ _logger = logging.getLogger(__name__)
 
 
 class BlockEncoding:
-    """Encodes the blocks of one stream on a thread of `pool`, and hands the stream's output on in its order. Everything
-    but the encoding happens on the event loop, whose `call_soon_threadsafe` is `post`.
+    """Encodes the blocks of one stream on a thread of `pool`, each listener's with an encoder of its own made by
+    `new_encoder`, and hands the stream's output on in its order. Everything but the encoding happens on the event loop,
+    whose `call_soon_threadsafe` is `post`.
 
     While output is being encoded, more may come: it waits, and is encoded together. If more than `capacity` blocks and
     messages wait, `put` takes nothing and returns False.
@@ -28,7 +30,7 @@ class BlockEncoding:
 
     def __init__(
         self,
-        encoder: BlockEncoder,
+        new_encoder: Callable[[], BlockEncoder],
         pool: ThreadPool,
         *,
         block_s: float,
@@ -36,10 +38,13 @@ class BlockEncoding:
         post: Callable[[Callable[[], None]], object],
         deliver: Callable[[list[Outgoing]], None],
     ) -> None:
-        self._encoder = encoder
+        self._new_encoder = new_encoder
+        self._encoders: dict[int, BlockEncoder] = {}
+        """By the numbers of listeners."""
         self._pool = pool
         self._block_s = block_s
-        self._capacity = capacity
+        self.capacity = capacity
+        """How many blocks and messages may wait."""
         self._post = post
         self._deliver = deliver
         self._blocks = 0
@@ -49,11 +54,11 @@ class BlockEncoding:
 
     @property
     def load(self) -> float:
-        """Share of a core that encoding has taken so far; 0 before the first block."""
+        """Share of a core that encoding the blocks of all listeners has taken so far; 0 before the first block."""
         return self._cpu_s / (self._blocks * self._block_s) if self._blocks else 0.0
 
     def put(self, outgoing: list[Outgoing]) -> bool:
-        if len(self._waiting) + len(outgoing) > self._capacity:
+        if len(self._waiting) + len(outgoing) > self.capacity:
             return False
         self._waiting += outgoing
         self._begin()
@@ -70,17 +75,25 @@ class BlockEncoding:
         began_s = time.thread_time()
         try:
             for each in outgoing:
-                if isinstance(each, TimedBlock):
-                    each.packets = self._encoder.encode(each.block.sample_clock, each.block.samples)
+                match each:
+                    case TimedBlock(block):
+                        each.packets = self._encoder_of(block.listener).encode(block.sample_clock, block.samples)
+                    case ListenerRemoved():
+                        self._encoders.pop(each.index, None)
         except Exception:
             _logger.exception("a stream could not be encoded")
             outgoing = [StreamFailed()]
-        self._blocks += sum(isinstance(each, TimedBlock) for each in outgoing)
+        self._blocks += sum(isinstance(each, TimedBlock) and each.block.listener == 0 for each in outgoing)
         self._cpu_s += time.thread_time() - began_s
         try:
             self._post(lambda: self._finish(outgoing))
         except RuntimeError:  # the loop is closed
             _logger.debug("the server ended while a stream was encoded")
+
+    def _encoder_of(self, listener: int) -> BlockEncoder:
+        if listener not in self._encoders:
+            self._encoders[listener] = self._new_encoder()
+        return self._encoders[listener]
 
     def _finish(self, encoded: list[Outgoing]) -> None:
         self._is_encoding = False

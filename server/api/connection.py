@@ -32,6 +32,7 @@ from typing import Final
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
+from server.acoustics.geometry import Pose
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
@@ -62,16 +63,19 @@ from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
+    AddListener,
     ClientMessage,
     Hello,
     ListenerPose,
     MoveEmitter,
     Ping,
     RemoveEmitter,
+    RemoveListener,
     Resume,
     SetEffects,
     SetLevel,
     emitter_of,
+    listener_of,
     parse_client_message,
     require_protocol,
 )
@@ -89,7 +93,16 @@ from server.protocol.codes import (
 )
 from server.protocol.opus import OpusOptions
 from server.protocol.packets import BlockEncoder, LiveDecoders
-from server.protocol.server_messages import EmitterEnded, Error, Pong, Resumed, ServerMessage, SnapshotTaken, Welcome
+from server.protocol.server_messages import (
+    EmitterEnded,
+    Error,
+    Pong,
+    Resumed,
+    ResumedListener,
+    ServerMessage,
+    SnapshotTaken,
+    Welcome,
+)
 from server.protocol.snapshot import MOST_BYTES, Seal, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
@@ -99,6 +112,7 @@ from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
 from server.runtime.traces import span
 from server.streaming.admission import Admission, Place, Refusal
+from server.streaming.audience import NewListener, Roster
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
 from server.streaming.headroom import RenderCost, StreamKind
@@ -407,6 +421,9 @@ class Connection:
         """How blocks without packets are sent."""
         self._block_encoding: BlockEncoding | None = None
         self._live_decoders: LiveDecoders | None = None
+        self._roster = Roster(host.settings.max_listeners)
+        self._window = 0
+        """Blocks of a listener that may be unacknowledged."""
         self._session = ""
         self._token: str | None = None
         self._is_confirmed = False
@@ -495,11 +512,13 @@ class Connection:
             if offer is None:
                 return None
             steps, others = self._steps(hello, levels, offer)
+            self._require_seats(hello)
         except RequestError as refusal:
             return _refused(refusal)
         place = None if lost is None else lost.kept.place
         if place is None:
-            admitted = host.admission.admit(host.kind_of(hello, levels), steps, hello.emitters, others=others)
+            kind, listeners = host.kind_of(hello, levels), hello.listeners or 1
+            admitted = host.admission.admit(kind, steps, hello.emitters, listeners=listeners, others=others)
             if isinstance(admitted, Refusal):
                 return _busy(admitted)
             place = admitted
@@ -516,6 +535,13 @@ class Connection:
                 host.kept.close(self._token)
             if not place.is_kept:
                 host.admission.leave(place)
+
+    def _require_seats(self, hello: Hello) -> None:
+        """Raises RequestError too_many_listeners."""
+        most = self._host.settings.max_listeners
+        # guard: a stream has room for so many listeners
+        if (hello.listeners or 1) > most:
+            raise RequestError("too_many_listeners", f"a stream has at most {most} listeners", field="listeners")
 
     async def _receive_first(self) -> Hello | Resume | Goodbye:
         host = self._host
@@ -593,7 +619,7 @@ class Connection:
         field = levels.default
         hrtf = DEFAULT_HRTF if hello.hrtf is None else hello.hrtf
         window = math.ceil(settings.window_blocks * field.sample_rate / levels.own_rate) + hello.buffer_blocks
-        self._capacity = window + MAX_WAITING_ANSWERS
+        self._window, self._capacity = window, window + MAX_WAITING_ANSWERS
         try:
             opened = await self._host.openings.run(
                 partial(self._open_session, hello, levels, hrtf, ladder.step, window, lost), is_wanted=self._is_there
@@ -602,16 +628,18 @@ class Connection:
             return _refused(refusal)
         if opened is None:
             return None
-        session, errors = opened
+        session, others, errors = opened
         block_s = hello.block_size / field.sample_rate
         encoder = None
         if is_of_samples(hello.encoding):
             self._encoding = hello.encoding
         else:
             options = OpusOptions() if hello.opus is None else hello.opus
-            encoder = BlockEncoder(options, channels=session.renderer.outputs, sample_rate=field.sample_rate)
+            channels = session.renderer.outputs
+            new_encoder = partial(BlockEncoder, options, channels=channels, sample_rate=field.sample_rate)
+            encoder = new_encoder()
             self._block_encoding = BlockEncoding(
-                encoder,
+                new_encoder,
                 self._host.encoders,
                 block_s=hello.block_size / field.sample_rate,
                 capacity=self._capacity,
@@ -636,16 +664,17 @@ class Connection:
                 ir_samples=field.ir_samples,
                 hrtf=hrtf,
                 level=ladder.step.level,
-                max_emitters=self._host.settings.max_emitters,
+                max_emitters=settings.max_emitters,
+                max_listeners=None if hello.listeners is None else settings.max_listeners,
                 resume_token=self._token,
                 resume_s=None if self._token is None else self._host.kept.keep_s,
-                resumed=None if lost is None else self._continue(session, lost, block_s),
+                resumed=None if lost is None else self._continue(session, others, lost, block_s),
                 order=hello.ambisonic_order,
                 opus=None if encoder is None else encoder.streams,
             )
         )
         self._enqueue(errors)
-        return Stream(
+        stream = Stream(
             session,
             levels,
             offer=offer,
@@ -654,8 +683,12 @@ class Connection:
             lead=hello.buffer_blocks,
             deliver=self._deliver,
         )
+        for each in others:
+            stream.audience.join(each, ladder.step, sequence=session.window.next_sequence)
+            self._widen(1)
+        return stream
 
-    def _continue(self, session: Session, lost: _LostStream, block_s: float) -> Resumed:
+    def _continue(self, session: Session, others: Sequence[NewListener], lost: _LostStream, block_s: float) -> Resumed:
         """Set the clock of a session to where that of a `lost` stream would be if the next block played now."""
         snapshot, sequence = lost.snapshot, lost.asked.sequence
         most = math.ceil(max(self._host.kept.keep_s, self._host.settings.snapshot_lifetime_s) / block_s)
@@ -669,6 +702,7 @@ class Connection:
             sequence=snapshot.sequence if sequence is None else sequence + 1,
             pose_id=snapshot.pose_id,
             handled=snapshot.handled,
+            listeners=tuple(ResumedListener(id=each.message.id, index=each.session.index) for each in others),
         )
         session.continue_at(resumed.sample_clock, resumed.sequence)
         self._handled = snapshot.handled
@@ -698,14 +732,48 @@ class Connection:
         quality: QualityStep,
         window: int,
         lost: _LostStream | None,
-    ) -> tuple[Session, list[ServerMessage]]:
-        """A session, and what of a `lost` stream it could not restore."""
+    ) -> tuple[Session, list[NewListener], list[ServerMessage]]:
+        """The session of the first listener, those of others that a `lost` stream had, and what of it could not be
+        restored."""
+        session = self._new_session(hello, levels, hrtf, quality, window)
+        if lost is None:
+            return session, [], []
+        errors, others = session.restore(lost.snapshot), []
+        for kept in lost.snapshot.listeners:
+            message = kept.listener
+            try:
+                number = self._roster.enter(message.id, kept.index)
+                others.append(self._new_listener(message, number, hello, levels, quality))
+            except RequestError as refusal:
+                errors.append(Error.from_refusal(refusal, listener=message.id))
+        return session, others, errors
+
+    def _new_listener(
+        self, message: AddListener, number: int, hello: Hello, levels: FieldsByLevel, quality: QualityStep
+    ) -> NewListener:
+        """A listener with a session that has rendered nothing yet. Raises RequestError unknown_hrtf, and
+        position_out_of_bounds."""
+        hrtf = message.hrtf or hello.hrtf or DEFAULT_HRTF
+        session = self._new_session(hello, levels, hrtf, quality, self._window, listener=message.pose, index=number)
+        return NewListener(message, session, hrtf)
+
+    def _new_session(
+        self,
+        hello: Hello,
+        levels: FieldsByLevel,
+        hrtf: str,
+        quality: QualityStep,
+        window: int,
+        *,
+        listener: Pose | None = None,
+        index: int = 0,
+    ) -> Session:
         host, rate = self._host, levels.default.sample_rate
         filters, field_filters = host.head(hrtf, levels)
         clips = host.clips[hello.scene].at_rate(rate)
         # What effects cost is measured at the scene's own rate, and no plan says what is true of another.
         costs = host.effect_costs.get(hello.scene, {}) if rate == levels.own_rate else {}
-        session = Session(
+        return Session(
             hello,
             levels,
             filters,
@@ -722,8 +790,9 @@ class Connection:
             ),
             costs=lambda bus: costs.get(bus, {}),
             field_filters=field_filters,
+            listener=listener,
+            index=index,
         )
-        return session, [] if lost is None else session.restore(lost.snapshot)
 
     async def _pump(self, stream: Stream, hello: Hello, place: Place) -> Goodbye | None:
         """Read and send. Returns None if the client has gone, or else the reason to end the connection."""
@@ -767,7 +836,8 @@ class Connection:
             self._stream = self._place = None
             self._figures = {
                 "duration_s": round(self._time_s() - opened_s, 3),
-                "blocks_sent": stream.session.window.sent,
+                "blocks_sent": stream.audience.totals()[0]["sent"],
+                "listeners": len(self._roster),
                 "blocks_late": stream.blocks_late,
             }
             for task in tasks:
@@ -851,7 +921,7 @@ class Connection:
         message: ClientMessage | None = None
         try:
             message = self._parse(data)
-            if isinstance(message, AddEmitter):
+            if isinstance(message, AddEmitter | AddListener):
                 return False
             self._pass_on(message, self._stream)
         except RequestError as refusal:
@@ -867,14 +937,61 @@ class Connection:
                 # Decoded here, off the event loop, so that the audio thread need not wait.
                 clips = self._host.clips[hello.scene].at_rate(stream.sample_rate)
                 await asyncio.to_thread(load_clip, clips, self._host.clip_store, message.clip)
-            self._pass_on(message, stream)
+            if isinstance(message, AddListener):
+                await self._add_listener(message, stream, hello)
+            else:
+                self._pass_on(message, stream)
         except RequestError as refusal:
             self._refuse(refusal, message)
         self._handled += _counts(message, data)
 
+    async def _add_listener(self, message: AddListener, stream: Stream, hello: Hello) -> None:
+        """Make a session for another listener, off the event loop, and hand it to the stream. Messages that come
+        meanwhile wait. Raises RequestError duplicate_listener, too_many_listeners, unknown_hrtf,
+        position_out_of_bounds, too_many_messages, or server_busy if it has no room."""
+        host, place = self._host, self._place
+        assert place is not None
+        levels = stream.levels
+        number = self._roster.enter(message.id)
+        try:
+            if (refusal := host.admission.add_listener(place)) is not None:
+                raise refusal.error
+            try:
+                if message.hrtf is not None:
+                    await asyncio.to_thread(host.head, message.hrtf, levels)
+                make = partial(self._new_listener, message, number, hello, levels, stream.ladder.step)
+                new = await host.openings.run(make, is_wanted=self._is_there)
+                if new is None:
+                    return
+                self._widen(1)
+                if not stream.offer(new):
+                    self._widen(-1)
+                    raise RequestError("too_many_messages", "too many messages in one block: this one was ignored")
+            except RequestError:
+                host.admission.remove_listener(place)
+                raise
+        except RequestError:
+            self._roster.leave(message.id)
+            raise
+        _logger.info("listener added", extra={"listener": message.id, "index": number, "hrtf": new.hrtf})
+
+    def _remove_listener(self, message: RemoveListener, place: Place) -> None:
+        """Raises RequestError unknown_listener."""
+        self._roster.leave(message.id)
+        self._host.admission.remove_listener(place)
+        self._widen(-1)
+        _logger.info("listener removed", extra={"listener": message.id})
+
+    def _widen(self, listeners: int) -> None:
+        """Note how many blocks of so many more listeners may wait to be sent."""
+        self._capacity += listeners * self._window
+        if self._block_encoding is not None:
+            self._block_encoding.capacity = self._capacity
+
     def _refuse(self, refusal: RequestError, message: ClientMessage | None) -> None:
         """Tell the client that a message was refused; None stands for one that could not be read."""
-        self._enqueue([Error.from_refusal(refusal, None if message is None else emitter_of(message))])
+        about = (None, None) if message is None else (emitter_of(message), listener_of(message))
+        self._enqueue([Error.from_refusal(refusal, *about)])
 
     def _pass_on(self, message: ClientMessage, stream: Stream) -> None:
         """Answer a ping, or put the message into the stream's inbox. Raises RequestError too_many_messages, or
@@ -904,6 +1021,8 @@ class Connection:
                 admission.remove_emitter(place)
                 if self._live_decoders is not None:
                     self._live_decoders.forget(message.id)
+            case RemoveListener():
+                self._remove_listener(message, place)
             case SetEffects() if any(message.effects.values()) or message.output not in {None, "mono"}:
                 refusal = admission.add_effects(place)
             case SetLevel():

@@ -103,27 +103,33 @@ def message_cost(message: bytes, *, is_text: bool) -> float:
 
 
 def supersedes(newer: bytes, older: bytes) -> bool:
-    """Whether two successive messages are listener poses with rising ids, so that the older one never takes effect. The
-    messages are not parsed, so the answer is False in unclear cases."""
-    newer_id, older_id = _pose_id(newer), _pose_id(older)
-    return newer_id is not None and older_id is not None and newer_id > older_id
+    """Whether two successive messages are poses of one listener with rising ids, so that the older one never takes
+    effect. The messages are not parsed, so the answer is False in unclear cases."""
+    newer_pose, older_pose = _pose(newer), _pose(older)
+    if newer_pose is None or older_pose is None:
+        return False
+    return newer_pose[0] == older_pose[0] and newer_pose[1] > older_pose[1]
 
 
 _LIVE_KIND: Final = bytes([DryBlock.KIND])
 _OPUS_NUMBER: Final = bytes([NUMBERS["opus"]])
 _FRAMES: Final = slice(8, 12)  # of DryBlock.LAYOUT
 _BINARY_KIND: Final = bytes([ListenerPose.KIND])
-_ID = slice(4, 8)  # of ListenerPose.LAYOUT
+_NUMBER, _ID = 1, slice(4, 8)  # of ListenerPose.LAYOUT
 _TEXT_POSE: Final = re.compile(rb'"type"\s*:\s*"listener"\s*[,}]')
+_OTHER_LISTENER: Final = re.compile(rb'"(listener|index)"\s*:\s*(?!null)')
 _TEXT_ID: Final = re.compile(rb'"pose_id"\s*:\s*([0-9]{1,10})\s*[,}]')
 
 
-def _pose_id(message: bytes) -> int | None:
+def _pose(message: bytes) -> tuple[int, int] | None:
+    """The number of the listener and the id of a pose; None for another message, or a text with a listener's name."""
     if message[:1] == _BINARY_KIND:
-        return int.from_bytes(message[_ID], "little") if len(message) == ListenerPose.LAYOUT.size else None
+        if len(message) != ListenerPose.LAYOUT.size:
+            return None
+        return message[_NUMBER], int.from_bytes(message[_ID], "little")
     # Of a duplicate key the second counts, and after a backslash it may be part of a string.
     is_plain = message.count(b'"type"') == message.count(b'"pose_id"') == 1 and b"\\" not in message
-    if not is_plain or _TEXT_POSE.search(message) is None:
+    if not is_plain or _TEXT_POSE.search(message) is None or _OTHER_LISTENER.search(message) is not None:
         return None
     found = _TEXT_ID.search(message)
-    return None if found is None else int(found[1])
+    return None if found is None else (0, int(found[1]))

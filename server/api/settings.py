@@ -25,6 +25,7 @@ from server.core.errors import NafirError
 from server.core.files import require_readable, require_writable_folder
 from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
+from server.protocol.client_messages import MOST_LISTENERS
 from server.runtime.open_files import allow_connections
 
 _PREFIX = "NAFIR_"
@@ -148,13 +149,15 @@ class Settings(BaseSettings):
     max_streams: Annotated[int, Field(ge=1)] = 64
     """Live streams that may be open at once; one more is refused with `server_busy`."""
     admission: bool = True
-    """Whether a stream, an emitter, a level or an effect is refused (`server_busy`) where it would break somebody's
-    sound. Without it only `max_streams` limits them, and under load all streams lose quality together."""
+    """Whether a stream, an emitter, a listener, a level or an effect is refused (`server_busy`) where it would break
+    somebody's sound. Without it only `max_streams` limits them, and under load all streams lose quality together."""
     shared_tail: bool = False
     """Whether all emitters of a stream share one late reverberation, each at its own level. Many emitters cost less,
     and only the part of a response after 32 blocks is shared."""
     max_emitters: Annotated[int, Field(ge=1, le=64)] = 16
     """Emitters that one stream may have at once."""
+    max_listeners: Annotated[int, Field(ge=1, le=MOST_LISTENERS)] = 8
+    """Listeners that one stream may have at once. Each costs about as much as a stream of its own."""
     window_blocks: Annotated[int, Field(ge=1)] = 32
     """Blocks that may be unacknowledged, in addition to the `buffer_blocks` that a client asks for. At another sample
     rate than the scene's there are more or fewer, which last as long."""

@@ -25,18 +25,15 @@ class StreamTotals:
     @classmethod
     def of(cls, stream: Stream) -> Self:
         totals = cls()
-        session = stream.session
-        totals.counts["sent"] = session.window.sent
+        counts, times = stream.audience.totals()
+        totals.counts.update(counts)
         totals.counts["late"] = stream.blocks_late
-        totals.counts["dropped"] = session.blocks_dropped
-        totals.counts["exchanges"] = session.ir_exchanges
-        totals.counts["limited"] = session.blocks_limited
-        totals.counts["silenced"] = session.renderer.samples_silenced
         totals.regrets.merge(stream.regrets)
         totals.durations["render"].merge(stream.times.render)
         totals.durations["lateness"].merge(stream.times.lateness)
-        totals.durations["ir"].merge(stream.times.response)
-        totals.durations["pose"].merge(stream.times.pose.durations)
+        for each in times:
+            totals.durations["ir"].merge(each.response)
+            totals.durations["pose"].merge(each.pose.durations)
         return totals
 
     def merge(self, other: "StreamTotals") -> None:

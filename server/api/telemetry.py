@@ -6,7 +6,7 @@ clients.
 
 import platform
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from importlib.metadata import version
 from typing import Protocol
 
@@ -134,7 +134,7 @@ class ServerCollector(Collector):
             value=self._host.audio.moves,
         )
 
-    def _streams(self, streams: Iterable[Stream]) -> Iterator[Metric]:
+    def _streams(self, streams: Collection[Stream]) -> Iterator[Metric]:
         levels = Counter((stream.scene, stream.session.quality.level) for stream in streams)
         eased = Counter(stream.scene for stream in streams if stream.ladder.is_eased)
         by_level = GaugeMetricFamily(
@@ -144,6 +144,15 @@ class ServerCollector(Collector):
             for level in offer.levels:
                 by_level.add_metric([scene, level.name], levels[scene, level.name])
         yield by_level
+        counts: Counter[str] = Counter()
+        for stream in streams:
+            counts[stream.scene] += len(stream.audience.members)
+        listeners = GaugeMetricFamily(
+            "nafir_listeners", "Listeners of open streams: one of each, and those added to it.", labels=["scene"]
+        )
+        for scene in tuple(self._host.offers):
+            listeners.add_metric([scene], counts[scene])
+        yield listeners
         below = GaugeMetricFamily(
             "nafir_streams_eased", "Streams below their best quality because of load.", labels=["scene"]
         )

@@ -62,7 +62,8 @@ class AudioBlock:
     blocks that the server skipped. `pose_id` is the newest pose that the direct sound of this block moves to.
     `reverberation_pose_id` is the newest pose whose impulse responses are all in effect; with `is_exchange` this block
     fades to them. With `is_late` the block was sent after a player with `buffer_blocks` in reserve had run out of
-    audio. With `is_limited` the block would have been too loud and was turned down.
+    audio. With `is_limited` the block would have been too loud and was turned down. `listener` is the number of the
+    listener who hears it: 0 for the first. Each has a sequence of its own, and all have one clock.
 
     In Opus a block holds the packets that its samples have completed: none, one or several for each of the streams that
     `welcome.opus` lists. What they decode to is heard from `sample_clock` on, as samples are, and `frames` counts it.
@@ -80,6 +81,7 @@ class AudioBlock:
     is_late: bool = False
     is_limited: bool = False
     is_restart: bool = False
+    listener: int = 0
 
     type: ClassVar[str] = "audio_block"
     KIND: ClassVar[int] = 1
@@ -88,8 +90,9 @@ class AudioBlock:
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
         ("flags", "B", "sum of " + ", ".join(f"{bit} {name}" for name, bit in FLAGS.items())),
-        ("channels", "H", "2 for headphones, 1 for a mono output, 4, 9 or 16 for ambisonics"),
-        ("sequence", "I", "number of the block among those sent, from 0, without gaps, modulo 2^32"),
+        ("channels", "B", "2 for headphones, 1 for a mono output, 4, 9 or 16 for ambisonics"),
+        ("listener", "B", "number of the listener, 0 for the first"),
+        ("sequence", "I", "number of the block among those sent to the listener, from 0, without gaps, modulo 2^32"),
         ("sample_clock", "Q", "samples from the start of the stream to the first frame that is heard"),
         ("pose_id", "I", "newest pose of the direct sound"),
         ("reverberation_pose_id", "I", "newest pose of the reflected field"),
@@ -115,7 +118,8 @@ class AudioBlock:
                 flags |= bit
         poses = self.pose_id, self.reverberation_pose_id
         # guard: sequences wrap round
-        return self.LAYOUT.pack(self.KIND, flags, channels, self.sequence % 2**32, self.sample_clock, *poses, frames)
+        whose = channels, self.listener
+        return self.LAYOUT.pack(self.KIND, flags, *whose, self.sequence % 2**32, self.sample_clock, *poses, frames)
 
     @classmethod
     def parse(cls, data: bytes, encoding: SampleEncoding) -> Self:
@@ -137,9 +141,8 @@ class AudioBlock:
     def _parse_header(cls, data: bytes) -> Self:
         if len(data) < cls.HEADER_BYTES or data[0] != cls.KIND:
             raise ValueError("not an audio block")
-        _, flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames = cls.LAYOUT.unpack_from(
-            data
-        )
+        _, flags, channels, listener, sequence, sample_clock, *rest = cls.LAYOUT.unpack_from(data)
+        pose_id, reverberation_pose_id, frames = rest
         return cls(
             sequence,
             sample_clock,
@@ -147,6 +150,7 @@ class AudioBlock:
             reverberation_pose_id,
             np.broadcast_to(np.float32(0), (channels, frames)),
             **{name: bool(flags & bit) for name, bit in cls.FLAGS.items()},
+            listener=listener,
         )
 
 

@@ -40,12 +40,15 @@ from server.protocol.message import WHOLE, Integer, Message, Position
 from server.protocol.opus import OpusOptions
 
 PROTOCOL: Final = 3
+MOST_LISTENERS: Final = 64
+"""Listeners that any stream may have; a server may allow fewer."""
 AUTO = "auto"
 """Name of a level in messages; it lets the server choose the quality level."""
 
 # guard: a block is as long as blocks may be
 BlockSize = Literal[128, 256, 512, 1024]
 EmitterId = Annotated[str, Field(min_length=1, max_length=64)]
+ListenerId = Annotated[str, Field(min_length=1, max_length=64)]
 # guard: a pose id ends where its number does
 PoseId = Annotated[int, Field(ge=0, lt=2**32), WHOLE]
 Orientation = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
@@ -110,8 +113,9 @@ class Hello(Message):
     them by its listener's orientation and decodes them; a turn then changes nothing in the blocks. `effects` switches
     effects on or off, whatever the plan would decide. `emitters` is how many emitters the client is about to add: the
     server lets the stream in only if they fit, and keeps room for them for some seconds. Without it the server expects
-    as many as other streams have. With `snapshots` the server sends a `snapshot` every few
-    seconds, if it gives any."""
+    as many as other streams have. `listeners` is how many listeners the stream is about to have, with the first one:
+    room is kept for them in the same way, and `welcome` says with `max_listeners` how many there may be. With
+    `snapshots` the server sends a `snapshot` every few seconds, if it gives any."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -127,6 +131,7 @@ class Hello(Message):
     order: Annotated[int, Field(ge=1, le=HIGHEST_ORDER), WHOLE] | None = None
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
     emitters: Annotated[int, Field(ge=0, le=64), WHOLE] | None = None
+    listeners: Annotated[int, Field(ge=1, le=MOST_LISTENERS), WHOLE] | None = None
     # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
     snapshots: bool = False
@@ -157,7 +162,8 @@ class Resume(Message):
     """The first message of a client whose connection was lost, in place of a `hello`: the stream goes on, with its
     emitters, clips, gains, level, effects and clock. `token` is that of the last `welcome`, `snapshot` that of the last
     message `snapshot`; one of them is needed, and if the server knows the token it needs no snapshot. `sequence` and
-    `sample_clock` are those of the last block that arrived: later blocks have greater ones. The answer is a `welcome`
+    `sample_clock` are those of the last block that arrived, the greatest of all listeners: later blocks have greater
+    ones. The answer is a `welcome`
     with `resumed`, or the error `unknown_resume_token`, after which a `hello` begins anew."""
 
     type: Literal["resume"] = "resume"
@@ -294,7 +300,7 @@ class SetGain(Message):
 
 
 class SetLevel(Message):
-    """Chooses a quality level, or auto. A `level_changed` says from when it is heard."""
+    """Chooses a quality level, or auto, for all listeners. A `level_changed` says from when it is heard."""
 
     type: Literal["set_level"] = "set_level"
     level: LevelName
@@ -302,7 +308,8 @@ class SetLevel(Message):
 
 class SetEffects(Message):
     """Switches effects on or off, whatever the plan would decide; null leaves an effect to the plan. Also sets what
-    plays the sound, but neither to nor from ambisonics. A `plan_changed` says which effects are on then."""
+    plays the sound, but neither to nor from ambisonics. Both count for all listeners. A `plan_changed` says which
+    effects are on then."""
 
     type: Literal["set_effects"] = "set_effects"
     effects: dict[str, bool | None] = Field(default_factory=dict, max_length=32)
@@ -316,17 +323,46 @@ class RemoveEmitter(Message):
     id: EmitterId
 
 
+class AddListener(_Directed):
+    """Adds a listener to the stream, who hears the same emitters at the same time: a player at a split screen, or a
+    spectator. Its first block has the clock that `listener_added` says, and what sounds then fades in. Its blocks have
+    its number (`index`) in their headers, and acknowledgements, levels under load and effects of its own. `hrtf` names
+    its head; without it, it has that of the `hello`. Output, encoding, block size and sample rate are the stream's. The
+    position and direction are those of its pose until its first `listener`, and count as the stream's newest pose."""
+
+    type: Literal["add_listener"] = "add_listener"
+    id: ListenerId
+    hrtf: Annotated[str, Field(max_length=256)] | None = None
+
+
+class RemoveListener(Message):
+    """Removes a listener. Its id may be used again. The first listener, who has no id, goes with the stream."""
+
+    type: Literal["remove_listener"] = "remove_listener"
+    id: ListenerId
+
+
 class ListenerPose(_Directed):
-    """The newest pose of the listener, as text or as 36 bytes."""
+    """The newest pose of a listener, as text or as 36 bytes. `listener` is the id of its `add_listener`, or `index` its
+    number; without either, and with the number 0, it is the stream's first listener."""
 
     type: Literal["listener"] = "listener"
     pose_id: PoseId
+    listener: ListenerId | None = None
+    index: Annotated[int, Field(ge=0, le=255), WHOLE] | None = None
+
+    @model_validator(mode="after")
+    def _is_of_one_listener(self) -> Self:
+        if self.listener is not None and self.index is not None:
+            raise PydanticCustomError("malformed_message", "give listener or index, not both")
+        return self
 
     KIND: ClassVar[int] = 2
     LAYOUT: ClassVar[Layout] = Layout(
         ("kind", "B", f"always {KIND}"),
-        ("zeros", "3x", "padding"),
-        ("pose_id", "I", "greater than all earlier ones, of the listener and of emitters"),
+        ("listener", "B", "number of the listener, 0 for the first"),
+        ("zeros", "2x", "padding"),
+        ("pose_id", "I", "greater than all earlier ones, of this listener and of emitters"),
         ("position", "3f", "x, y, z in metres"),
         ("orientation", "4f", "quaternion x, y, z, w; the identity looks along +x"),
     )
@@ -343,23 +379,27 @@ class ListenerPose(_Directed):
         # guard: a binary pose is as long as it is
         if len(data) != cls.LAYOUT.size:
             raise RequestError("malformed_pose", f"a binary pose has {cls.LAYOUT.size} bytes, not {len(data)}")
-        _, pose_id, *numbers = cls.LAYOUT.unpack(data)
+        _, index, pose_id, *numbers = cls.LAYOUT.unpack(data)
+        whose = {"index": index} if index else {}
         try:
-            return cls(pose_id=pose_id, position=tuple(numbers[:3]), orientation=tuple(numbers[3:]))
+            return cls(pose_id=pose_id, position=tuple(numbers[:3]), orientation=tuple(numbers[3:]), **whose)
         except ValidationError as exc:
             # guard: a binary pose that is none is refused by code
             raise _refusal(exc, is_tagged=False) from exc
 
     def serialize_binary(self) -> bytes:
+        """The pose as bytes, which know a listener by its number alone."""
         pose = self.pose
-        return self.LAYOUT.pack(self.KIND, self.pose_id, *pose.position, *pose.orientation)
+        return self.LAYOUT.pack(self.KIND, self.index or 0, self.pose_id, *pose.position, *pose.orientation)
 
 
 class Acknowledge(Message):
-    """Says that every block up to and including `sequence` has arrived."""
+    """Says that every block of a listener up to and including `sequence` has arrived; without `listener` of the
+    stream's first one."""
 
     type: Literal["acknowledge"] = "acknowledge"
     sequence: Annotated[int, Field(ge=0, lt=2**32), WHOLE]
+    listener: ListenerId | None = None
 
 
 class Ping(Message):
@@ -379,6 +419,8 @@ TextMessage = (
     | SetLevel
     | SetEffects
     | RemoveEmitter
+    | AddListener
+    | RemoveListener
     | ListenerPose
     | Acknowledge
     | Ping
@@ -394,6 +436,16 @@ def emitter_of(message: ClientMessage) -> str | None:
     """The id of the emitter that a message is about; None if it is about none."""
     about_one = AddEmitter | MoveEmitter | StopEmitter | SetGain | RemoveEmitter | DryBlock | DryPackets
     return message.id if isinstance(message, about_one) else None
+
+
+def listener_of(message: ClientMessage) -> str | None:
+    """The id of the listener that a message is about; None if it is about the first, or none."""
+    match message:
+        case AddListener() | RemoveListener():
+            return message.id
+        case ListenerPose() | Acknowledge():
+            return message.listener
+    return None
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
@@ -458,7 +510,7 @@ def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:
     if kind in {"union_tag_invalid", "union_tag_not_found"}:
         code, field = "unknown_message", "type"
     # guard: a pose that is impossible is refused by code
-    elif kind == "malformed_pose" or (place and place[0] in _POSE_FIELDS):
+    elif kind == "malformed_pose" or (place and place[0] in _POSE_FIELDS and not kind.startswith("string_")):
         code = "malformed_pose"
     elif place and place[0] == "directivity":
         code = "malformed_directivity"

@@ -9,6 +9,7 @@ from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
+    AddListener,
     ClientMessage,
     DirectivityPattern,
     Hello,
@@ -17,6 +18,7 @@ from server.protocol.client_messages import (
     MoveEmitter,
     Ping,
     RemoveEmitter,
+    RemoveListener,
     Resume,
     SetEffects,
     SetGain,
@@ -31,6 +33,8 @@ from server.protocol.server_messages import (
     EmitterRemoved,
     Error,
     LevelChanged,
+    ListenerAdded,
+    ListenerRemoved,
     LiveStatus,
     Place,
     PlanChanged,
@@ -214,9 +218,19 @@ EXCHANGE: Final[tuple[Step, ...]] = (
             live=(LiveStatus(id="me", samples_queued=512, samples_dropped=0, samples_gated=0, underruns=0),),
         ),
     ),
+    Step("adds a second player, who hears the same from elsewhere", AddListener(id="p2", position=(3.0, 1.0, 1.6))),
+    Step("its blocks have the number 1", ListenerAdded(id="p2", index=1, hrtf="kemar", sample_clock=48_384)),
+    Step("the second player walks", ListenerPose(pose_id=4, position=(3.2, 1.0, 1.6), yaw=1.0, listener="p2")),
+    Step(
+        "the second player hears pose 4 (here cut to two frames)",
+        AudioBlock(7, 50_176, 4, 3, _TWO_FRAMES, listener=1),
+    ),
+    Step("the second player's blocks 0 to 7 have arrived", Acknowledge(sequence=7, listener="p2")),
+    Step("the second player leaves", RemoveListener(id="p2")),
+    Step("it is gone", ListenerRemoved(id="p2", index=1)),
     Step("measures the round-trip time", Ping(id=7)),
     Step("answers at once", Pong(id=7)),
-    Step("leaves the room", ListenerPose(pose_id=4, position=(99.0, 2.0, 1.6), yaw=0.0)),
+    Step("leaves the room", ListenerPose(pose_id=5, position=(99.0, 2.0, 1.6), yaw=0.0)),
     Step(
         "refuses that; the stream goes on",
         Error(
@@ -231,7 +245,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     Step("it is gone", EmitterRemoved(id="me")),
     Step(
         "hands the client the state of the stream, every few seconds if the hello asked for it",
-        SnapshotTaken(snapshot="c2lnbmVkIHN0YXRlIG9mIHRoZSBzdHJlYW0=", pose_id=4, handled=6, expires_s=120.0),
+        SnapshotTaken(snapshot="c2lnbmVkIHN0YXRlIG9mIHRoZSBzdHJlYW0=", pose_id=5, handled=8, expires_s=120.0),
     ),
     Step(
         "after a gap of the network, on a new connection, asks to go on",
@@ -243,7 +257,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
             update={
                 "level": "fast",
                 "resume_token": "Zr5uW8sK2nQe7vBx1cTg4hYj9mPd3LfA",
-                "resumed": Resumed(sample_clock=480_256, sequence=565, pose_id=4, handled=6),
+                "resumed": Resumed(sample_clock=480_256, sequence=565, pose_id=5, handled=8),
             }
         ),
     ),

@@ -54,16 +54,25 @@ class SceneDescription(Message):
     accepted_laws: tuple[AcceptedLaw, ...]
 
 
+class ResumedListener(Message):
+    """A listener that a resumed stream has besides the first, and its number."""
+
+    id: str
+    index: int
+
+
 class Resumed(Message):
     """Where a stream goes on. The next block has this `sample_clock` and `sequence`. `pose_id` is the newest pose, of
     listener or emitters, that had arrived before the connection was lost: send newer ones again. `handled` is how many
     other messages had: of all text messages since the `hello` other than `listener`, `move_emitter`, `acknowledge` and
-    `ping`. Send those after them again."""
+    `ping`. Send those after them again. `listeners` are those beside the first, if there are any; the blocks of each go
+    on with the same clock and sequence."""
 
     sample_clock: int
     sequence: int
     pose_id: int
     handled: int
+    listeners: Annotated[tuple[ResumedListener, ...], Field(exclude_if=lambda listeners: not listeners)] = ()
 
 
 class Welcome(Message):
@@ -71,7 +80,8 @@ class Welcome(Message):
     blocks. `sample_rate` is that of the stream, `ir_samples` the length of its longest response. `level` is the first
     quality level. `max_emitters` is how many emitters the stream may have at once. `order` is that of ambisonic
     channels; streams of other outputs do not have it. `opus` says how to decode the encoding `opus`; streams of other
-    encodings do not have it.
+    encodings do not have it. `max_listeners` is how many listeners the stream may have at once, if the `hello` said how
+    many it will have.
 
     With `resume_token` a client resumes the stream within `resume_s` seconds after its connection is lost. Keep it
     secret: whoever has it can take the stream over. `resumed` says where a resumed stream goes on; a new one does not
@@ -91,6 +101,7 @@ class Welcome(Message):
     hrtf: str
     level: str
     max_emitters: int | None = None
+    max_listeners: Annotated[int | None, Field(exclude_if=lambda count: count is None)] = None
     resume_token: Annotated[str | None, Field(exclude_if=lambda token: token is None)] = None
     resume_s: Annotated[float | None, Field(exclude_if=lambda seconds: seconds is None)] = None
     resumed: Annotated[Resumed | None, Field(exclude_if=lambda resumed: resumed is None)] = None
@@ -138,13 +149,32 @@ class EmitterRemoved(Message):
     id: str
 
 
+class ListenerAdded(Message):
+    """The listener is there. Its blocks have the number `index` in their headers, the first of them this
+    `sample_clock`."""
+
+    type: Literal["listener_added"] = "listener_added"
+    id: str
+    index: int
+    hrtf: str
+    sample_clock: int
+
+
+class ListenerRemoved(Message):
+    """The listener with this number was removed, and its id is free. No block of it follows."""
+
+    type: Literal["listener_removed"] = "listener_removed"
+    id: str
+    index: int
+
+
 class LevelChanged(Message):
     """The quality changes at `sample_clock`. Impulse responses are of `level` from then on. Each emitter gets at most
     `ir_rate_hz` of them a second or, if that is null, one for every pose. With `shared_tail` all emitters share one
     late reverberation.
 
     `reason` is `chosen` (by the client), `load` (the server had too much to do for the better quality) or `recovered`
-    (it no longer has).
+    (it no longer has). `listener` is the id of the listener who hears it; without it, it is the first one.
     """
 
     type: Literal["level_changed"] = "level_changed"
@@ -153,6 +183,7 @@ class LevelChanged(Message):
     ir_rate_hz: float | None
     shared_tail: bool
     sample_clock: int
+    listener: Annotated[str | None, Field(exclude_if=lambda listener: listener is None)] = None
 
 
 class EffectDecision(Message):
@@ -172,13 +203,15 @@ class EffectDecision(Message):
 
 
 class PlanChanged(Message):
-    """These effects are on from `sample_clock`, or are being faded in or out. Costs are microseconds per block."""
+    """These effects are on from `sample_clock`, or are being faded in or out. Costs are microseconds per block.
+    `listener` is the id of the listener who hears them; without it, it is the first one."""
 
     type: Literal["plan_changed"] = "plan_changed"
     decisions: tuple[EffectDecision, ...]
     cost_us: float
     saved_us: float
     sample_clock: int
+    listener: Annotated[str | None, Field(exclude_if=lambda listener: listener is None)] = None
 
     @classmethod
     def of(cls, plan: Plan, sample_clock: int) -> "PlanChanged":
@@ -225,7 +258,9 @@ class LiveStatus(Message):
 
 
 class Status(Message):
-    """Statistics of the stream, sent once a second. Counts and durations run from the start of the stream.
+    """Statistics of the stream, sent once a second for each listener: with the id `listener` for those beside the
+    first. Counts and durations run from the start of the stream or of the listener; `blocks_late`, `buffer_ms`,
+    `render_ms`, `lateness_ms` and `live` are of the whole stream.
 
     `buffer_ms` is how far the stream is ahead of real time. `render_ms` is the time to render a block, or its share of
     the time if several streams were rendered together. `lateness_ms` is the time from when a block was due until it
@@ -252,6 +287,7 @@ class Status(Message):
     level: str
     ir_rate_hz: float | None
     live: tuple[LiveStatus, ...] = ()
+    listener: Annotated[str | None, Field(exclude_if=lambda listener: listener is None)] = None
 
 
 class Pong(Message):
@@ -263,7 +299,8 @@ class Pong(Message):
 
 class Error(Message):
     """Says what was wrong with a message. The stream goes on, unless the message was the hello. `emitter` is the id of
-    the emitter that the message was about, if it was about one and could be read.
+    the emitter that the message was about, if it was about one and could be read; `listener` that of a listener beside
+    the first.
 
     What a server refuses because it has too much to do (`server_busy`) may be asked for again after `retry_after_s`
     seconds. `level` is the quality level at which a stream that insists on another would fit now, if there is one.
@@ -276,9 +313,10 @@ class Error(Message):
     retry_after_s: Annotated[int | None, Field(exclude_if=lambda seconds: seconds is None)] = None
     level: Annotated[str | None, Field(exclude_if=lambda level: level is None)] = None
     emitter: Annotated[str | None, Field(exclude_if=lambda emitter: emitter is None)] = None
+    listener: Annotated[str | None, Field(exclude_if=lambda listener: listener is None)] = None
 
     @classmethod
-    def from_refusal(cls, refusal: RequestError, emitter: str | None = None) -> Self:
+    def from_refusal(cls, refusal: RequestError, emitter: str | None = None, listener: str | None = None) -> Self:
         return cls(
             code=refusal.code,
             message=str(refusal),
@@ -286,6 +324,7 @@ class Error(Message):
             retry_after_s=refusal.retry_after_s,
             level=refusal.level,
             emitter=emitter,
+            listener=listener,
         )
 
 
@@ -295,6 +334,8 @@ ServerMessage = (
     | EmitterAdded
     | EmitterEnded
     | EmitterRemoved
+    | ListenerAdded
+    | ListenerRemoved
     | LevelChanged
     | PlanChanged
     | Status

@@ -1,8 +1,8 @@
 """The state of a stream as plain data, from which it goes on after its connection, its process or its host was lost.
 
-A snapshot consists of the messages that would bring about the state: a hello, and an `add_emitter` for each emitter. So
-it is validated as they are when it comes back, and a field that a message gains is kept by itself. Where clips are
-follows from the sample clock.
+A snapshot consists of the messages that would bring about the state: a hello, an `add_emitter` for each emitter, and an
+`add_listener` for each listener but the first. So it is validated as they are when it comes back, and a field that a
+message gains is kept by itself. Where clips are follows from the sample clock.
 
 A *sealed* snapshot is one that a client keeps: text with a signature, which any server takes that has the same secret.
 It is no secret, since it says only what the client itself has said.
@@ -20,7 +20,7 @@ from typing import Annotated, Final
 from pydantic import Field, ValidationError
 
 from server.core.errors import RequestError
-from server.protocol.client_messages import AddEmitter, Hello, PoseId, StopEmitter
+from server.protocol.client_messages import MOST_LISTENERS, AddEmitter, AddListener, Hello, PoseId, StopEmitter
 from server.protocol.message import Message
 
 MOST_SEALED: Final = 48 * 1024
@@ -45,6 +45,13 @@ class KeptEmitter(Message):
     newest_block: Annotated[int, Field(ge=-1, lt=2**32)] = -1
 
 
+class KeptListener(Message):
+    """A listener beside the first: the message that adds it as it is now, and its number."""
+
+    listener: AddListener
+    index: Annotated[int, Field(ge=1, le=255)]
+
+
 class Snapshot(Message):
     """A stream before the block that begins at `sample_clock` and would be sent with `sequence`. `pose_id` is the
     newest pose, and `handled` how many of the client's other messages are in effect or were refused."""
@@ -56,6 +63,7 @@ class Snapshot(Message):
     pose_id: PoseId
     handled: Annotated[int, Field(ge=0, lt=2**53)]
     emitters: Annotated[tuple[KeptEmitter, ...], Field(max_length=64)]
+    listeners: Annotated[tuple[KeptListener, ...], Field(max_length=MOST_LISTENERS)] = ()
 
     @classmethod
     def parse(cls, data: bytes) -> "Snapshot":

@@ -59,7 +59,7 @@ class RendererFullError(NafirError):
     spare slot."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Emitter:
     mixer: Mixer
     slot: int
@@ -74,6 +74,14 @@ class _Emitter:
     """Whether it has an IR that is in use; an IR that was dropped may still ring out."""
     has_path: bool = False
     has_played: bool = False
+    is_held: bool = False
+    """Whether it does not begin yet, although it could."""
+
+    @property
+    def can_begin(self) -> bool:
+        """Whether it has all that it needs to be heard, and is not held."""
+        has_response = self.has_ir or not self.awaits_ir
+        return not self.is_held and has_response and (self.has_path or self.mixer.direct is None)
 
 
 class Renderer:
@@ -282,6 +290,28 @@ class Renderer:
         self._mixer.set_gain(slot, gain)
         self._mixer.send[:, slot] = 1.0
 
+    def hold(self, emitter_id: str) -> None:
+        """Let an emitter not begin before `release`, even if it could. Raises UnknownEmitterError."""
+        self._emitter(emitter_id).is_held = True
+
+    def release(self, emitter_id: str, since: int | None = None) -> None:
+        """Let an emitter begin as soon as it can: from the beginning, or fading in where it would be if it had begun at
+        the clock `since`. Raises UnknownEmitterError."""
+        emitter = self._emitter(emitter_id)
+        emitter.is_held, emitter.since = False, since
+        self._changed.append(emitter)
+
+    def has_begun(self, emitter_id: str) -> bool:
+        """Whether an emitter plays. Raises UnknownEmitterError."""
+        return self._emitter(emitter_id).has_played
+
+    def take_gain(self, emitter_id: str, other: "Renderer") -> None:
+        """Have the gain of an emitter that has not begun be that of the same emitter of another renderer, in the middle
+        of a ramp, too. Raises UnknownEmitterError."""
+        emitter, theirs = self._emitter(emitter_id), other._emitter(emitter_id)
+        emitter.mixer.gain[:, emitter.slot] = theirs.mixer.gain[1, theirs.slot]
+        emitter.mixer.ramp[emitter.slot] = theirs.mixer.ramp[theirs.slot]
+
     def remove_emitter(self, emitter_id: str) -> None:
         """Ramp an emitter down over the next block and let it ring out; its id is free at once.
 
@@ -438,8 +468,7 @@ class Renderer:
     def _begin(self) -> tuple[Output, list[Mixer]]:
         """Apply the changes that were requested since the last block."""
         for emitter in self._changed:
-            has_response = emitter.has_ir or not emitter.awaits_ir
-            if has_response and (emitter.has_path or emitter.mixer.direct is None):
+            if emitter.can_begin:
                 emitter.token = emitter.next_token
                 if not emitter.has_played:
                     emitter.has_played = True

@@ -7,6 +7,7 @@ Where a clip is and when it starts and stops is one `PLAYBACK` record. Compiled 
 plays a copy of it; `ClipPlayer` does the same in NumPy.
 """
 
+from collections.abc import Callable
 from typing import Final, Protocol
 
 import numpy as np
@@ -172,6 +173,58 @@ def is_over(record: np.void) -> bool:
     """Whether a PLAYBACK record plays nothing any more."""
     is_played = record["starts_in"] <= 0 and not record["loop_end"] and record["at"] == record["samples"]
     return bool(is_played or record["stops_in"] <= -record["fade_out"])
+
+
+class SharedSource:
+    """One source that several renderers play, each through a `tap`: the first that asks for a block has it made, and
+    the others get the same samples. All have the same clock."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._clock = -1
+        """Of the block that was made last; -1 before the first."""
+        self._block: FloatArray = np.zeros(0, np.float32)
+
+    def tap(self, clock: Callable[[], int]) -> "SourceTap":
+        """Return the source for a renderer whose next block begins at `clock`."""
+        return SourceTap(self, clock)
+
+    def process(self, clock: int, out: FloatArray) -> None:
+        """Fill `out` (b,) with the block that begins at a clock."""
+        if clock != self._clock:
+            self._clock = clock
+            self._block = np.empty_like(out)
+            self._source.process(self._block)
+        np.copyto(out, self._block)
+
+    def skip(self, samples: int) -> None:
+        """Go on as if `samples` had been played, unless it plays already."""
+        if self._clock < 0:
+            self._source.skip(samples)
+
+    def reset(self) -> None:
+        self._clock = -1
+        self._source.reset()
+
+
+class SourceTap:
+    """A `SharedSource` as one renderer plays it."""
+
+    def __init__(self, shared: SharedSource, clock: Callable[[], int]) -> None:
+        self._shared = shared
+        self._clock = clock
+
+    def process(self, out: FloatArray) -> None:
+        """Fill `out` (b,) with the next samples."""
+        self._shared.process(self._clock(), out)
+
+    def skip(self, samples: int) -> None:
+        """Go on as if `samples`, >= 0, had been played before the next block."""
+        self._shared.skip(samples)
+
+    def reset(self) -> None:
+        """Start again from the beginning."""
+        self._shared.reset()
 
 
 class LiveSource:

@@ -45,7 +45,7 @@ from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.quality_steps import QualityStep
 from server.streaming.stream import Stream
 
-Asked = Literal["upgrade", "hello", "add_emitter", "set_level", "set_effects"]
+Asked = Literal["upgrade", "hello", "add_emitter", "add_listener", "set_level", "set_effects"]
 """What was refused: a connection before it became a WebSocket, or a message."""
 
 _WHY: Final[dict[Scarce, str]] = {
@@ -84,8 +84,8 @@ class Refusal:
 @dataclass(eq=False)
 class Place:
     """A stream's place on a server. `emitters` have been asked for, and room is kept for `reserved` until `until_s`;
-    until then it counts with its expected cost. `step` is the quality step on which it begins, on top of its ladder or
-    not."""
+    until then it counts with its expected cost. The same goes for `listeners` and `seats`. `step` is the quality
+    step on which it begins, on top of its ladder or not."""
 
     kind: StreamKind | None
     step: QualityStep
@@ -94,6 +94,8 @@ class Place:
     emitters: int
     reserved: int
     until_s: float
+    listeners: int = 1
+    seats: int = 1
     is_live: bool = False
     stream: Stream | None = None
     is_kept: bool = False
@@ -180,7 +182,7 @@ class Admission:
         if passed_s <= 0:
             return
         self._measured_s, self._measured_cpu_s = now_s, cpu_s
-        blocks_hz = sum(1 / stream.block_s for stream in self._engine.streams)
+        blocks_hz = sum(len(stream.audience.members) / stream.block_s for stream in self._engine.streams)
         if blocks_hz:
             # The event loop does other work too, so blocks take no more than what it took when it took least.
             seen_s = cpu_passed_s / passed_s / blocks_hz
@@ -215,7 +217,7 @@ class Admission:
                 load = load.plus(numbers.get(thread, 0), self._cost_of(stream, now_s))
         for place in self._places:
             if place.stream is None:
-                cost = self._expected(place, max(place.emitters, place.reserved))
+                cost = self._expected_by_then(place)
                 load = load.plus(place.thread, replace(cost, opening_s=0.0))
         return load
 
@@ -248,28 +250,30 @@ class Admission:
         steps: Sequence[QualityStep],
         emitters: int | None = None,
         *,
+        listeners: int = 1,
         others: Sequence[QualityStep] = (),
     ) -> Place | Refusal:
-        """Return a place on the first of the `steps` on which a stream fits, which will have so many `emitters`, or as
-        many as streams had lately. If none fits, the refusal names a level of the `others` that does."""
+        """Return a place on the first of the `steps` on which a stream fits, which will have so many `listeners` and
+        `emitters`, or as many emitters as streams had lately. If none fits, the refusal names a level of the `others`
+        that does."""
         load = self.load()
         if self.streams >= self._most_streams:
             return self._refuse("hello", "streams")
         thread = freest_thread(self._limits, load)
         reserved = max(1, self._usual_emitters if emitters is None else emitters)
         if kind is None or not self._is_on:
-            return self._take(kind, steps[0], thread, reserved, is_top=True)
+            return self._take(kind, steps[0], thread, reserved, listeners, is_top=True)
         found: Scarce | None = None
         for number, step in enumerate(steps):
-            cost = self._cost_on(kind, step, reserved, is_top=not number)
+            cost = self._cost_on(kind, step, reserved, listeners, is_top=not number)
             found = self._obstacle(load, thread, cost)
             if found is None:
-                return self._take(kind, step, thread, reserved, is_top=not number)
+                return self._take(kind, step, thread, reserved, listeners, is_top=not number)
         assert found is not None
         fitting = (
             step.level
             for step in others
-            if self._obstacle(load, thread, self._cost_on(kind, step, reserved, is_top=False)) is None
+            if self._obstacle(load, thread, self._cost_on(kind, step, reserved, listeners, is_top=False)) is None
         )
         return self._refuse("hello", found, level=next(fitting, None))
 
@@ -277,7 +281,7 @@ class Admission:
         """Note that the stream of a place begins, before the engine opens it."""
         place.stream, place.is_kept, place.until_s = stream, False, self._time_s() + self._limits.reserved_s
         self._by_stream[stream] = place
-        stream.expected_load = self._expected(place, place.reserved).rendering if place.kind else 0.0
+        stream.expected_load = self._expected_by_then(place).rendering if place.kind else 0.0
 
     def keep(self, place: Place) -> bool:
         """Hold the place of a stream that has lost its client, with what the stream is expected to cost. Return False,
@@ -288,6 +292,7 @@ class Admission:
             return False
         place.emitters = stream.session.emitter_count
         place.reserved, place.until_s = max(1, place.emitters), math.inf
+        place.seats = place.listeners
         place.step, place.is_top, place.is_asked = place.now_on, place.is_on_top, False
         place.thread = self._thread_of(stream)
         place.stream, place.is_kept = None, True
@@ -322,6 +327,23 @@ class Admission:
         """Note that an emitter of a stream goes."""
         place.emitters = max(0, place.emitters - 1)
 
+    def add_listener(self, place: Place) -> Refusal | None:
+        """Make room for another listener of a stream, with all its emitters; or return a refusal."""
+        self._count_emitters(place)
+        now_s = self._time_s()
+        after = replace(place, listeners=place.listeners + 1)
+        is_reserved = after.listeners <= place.seats and now_s < place.until_s
+        if not is_reserved and (found := self._found(place, after)) is not None:
+            return self._refuse("add_listener", found)
+        place.listeners = after.listeners
+        place.seats = max(place.seats, place.listeners)
+        self._keep(place, now_s)
+        return None
+
+    def remove_listener(self, place: Place) -> None:
+        """Note that a listener of a stream goes."""
+        place.listeners = max(1, place.listeners - 1)
+
     def choose(self, place: Place, steps: Sequence[QualityStep]) -> int | Refusal:
         """Return the number of the first of the `steps` to which a stream may change, or a refusal if there is none."""
         self._count_emitters(place)
@@ -347,6 +369,7 @@ class Admission:
         """Once a stream has shown what it takes, it has the emitters that it has."""
         if place.stream is not None and self._time_s() >= place.until_s:
             place.emitters = place.reserved = place.stream.session.emitter_count
+            place.seats = place.listeners
 
     def _found(self, before: Place, after: Place, *, is_whole: bool = False) -> Scarce | None:
         """Return what there is too little of for a stream to change: by the difference of what is expected of it or, if
@@ -360,15 +383,16 @@ class Admission:
         old, new = (self._expected(each, max(1, each.emitters)) for each in (before, after))
         base = StreamCost(0.0) if is_whole else present
         less = StreamCost(0.0) if is_whole else old
-        added = max(0, after.emitters - before.emitters)
+        added = max(0, after.emitters - before.emitters) / max(1, after.emitters)
+        joining = after.listeners - before.listeners
         cost = StreamCost(
             rendering=max(0.0, base.rendering + new.rendering - less.rendering),
-            loop=present.loop,
-            encoding=present.encoding,
+            loop=present.loop + new.loop - old.loop,
+            encoding=present.encoding + new.encoding - old.encoding,
             request_s=max(0.0, base.request_s + new.request_s - less.request_s),
             rate_hz=new.rate_hz,
             patience_s=new.patience_s,
-            opening_s=new.request_s * added / max(1, after.emitters),
+            opening_s=new.request_s * (joining / after.listeners if joining else added),
             is_top=after.is_on_top,
             is_live=present.is_live or after.is_live,
         )
@@ -382,14 +406,16 @@ class Admission:
         """Count a stream with its expected cost for some time more."""
         place.until_s = max(place.until_s, now_s + self._limits.shown_after_s)
         if place.stream is not None and place.kind is not None:
-            place.stream.expected_load = self._expected(place, max(place.emitters, place.reserved)).rendering
+            place.stream.expected_load = self._expected_by_then(place).rendering
 
-    def _take(self, kind: StreamKind | None, step: QualityStep, thread: int, reserved: int, *, is_top: bool) -> Place:
+    def _take(
+        self, kind: StreamKind | None, step: QualityStep, thread: int, reserved: int, seats: int, *, is_top: bool
+    ) -> Place:
         # Until its stream begins, a place is kept without end.
-        place = Place(kind, step, is_top, thread, emitters=0, reserved=reserved, until_s=math.inf)
+        place = Place(kind, step, is_top, thread, emitters=0, reserved=reserved, until_s=math.inf, seats=seats)
         self._places[place] = None
         if kind is not None:
-            self._opening_s += self._expected(place, reserved).opening_s
+            self._opening_s += self._expected_by_then(place).opening_s
             if self._is_on:
                 self._announce(self.load())
         return place
@@ -410,9 +436,16 @@ class Admission:
     def _obstacle(self, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
         return obstacle(self._limits, self._thresholds, load, thread, cost)
 
-    def _cost_on(self, kind: StreamKind, step: QualityStep, emitters: int, *, is_top: bool) -> StreamCost:
-        place = Place(kind, step, is_top, 0, emitters=emitters, reserved=emitters, until_s=0.0)
+    def _cost_on(
+        self, kind: StreamKind, step: QualityStep, emitters: int, listeners: int = 1, *, is_top: bool
+    ) -> StreamCost:
+        place = Place(kind, step, is_top, 0, emitters=emitters, reserved=emitters, until_s=0.0, listeners=listeners)
         return self._expected(place, emitters)
+
+    def _expected_by_then(self, place: Place) -> StreamCost:
+        """What a stream is expected to take once it has all the emitters and listeners for which room is kept."""
+        there = replace(place, listeners=max(place.listeners, place.seats))
+        return self._expected(there, max(place.emitters, place.reserved))
 
     def _expected(self, place: Place, emitters: int) -> StreamCost:
         if place.kind is None:
@@ -423,6 +456,7 @@ class Admission:
             place.kind,
             place.now_on,
             emitters=emitters,
+            listeners=place.listeners,
             correction=self._corrections.get((*place.kind.key, place.now_on.level), Correction()),
             block_sent_s=self._block_sent_s,
             is_top=place.is_on_top,
@@ -434,7 +468,7 @@ class Admission:
         shown = stream.shown
         cost = StreamCost(
             rendering=shown.rendering,
-            loop=self._block_sent_s / stream.block_s,
+            loop=self._block_sent_s / stream.block_s * len(stream.audience.members),
             encoding=stream.encoding_load,
             request_s=stream.request_s if shown.responses > 0 else 0.0,
             rate_hz=shown.responses / stream.request_s if stream.request_s else 0.0,
@@ -446,9 +480,10 @@ class Admission:
         if place is None or place.kind is None or now_s >= place.until_s:
             stream.expected_load = 0.0
             return cost
-        expected = self._expected(place, max(place.emitters, place.reserved))
+        expected = self._expected_by_then(place)
         return replace(
             cost,
+            loop=max(cost.loop, expected.loop),
             rendering=max(cost.rendering, expected.rendering),
             encoding=max(cost.encoding, expected.encoding),
             request_s=max(cost.request_s, expected.request_s),
@@ -488,7 +523,12 @@ class Admission:
             key = (*place.kind.key, stream.ladder.step.level)
             correction = self._corrections.get(key, Correction())
             plain = expected_cost(
-                self._limits, self._thresholds, place.kind, stream.ladder.step, emitters=max(1, emitters)
+                self._limits,
+                self._thresholds,
+                place.kind,
+                stream.ladder.step,
+                emitters=max(1, emitters),
+                listeners=len(stream.audience.members),
             )
             rendering = min(high, max(low, stream.shown.rendering / plain.rendering))
             requests = correction.requests

@@ -403,16 +403,17 @@ class AudioThread:
         made: dict[Stream, list[Outgoing]] = {}
         due: list[_Due] = []
         blocks_of = self._due(now_s)
-        self.turns.deal(self._streams)
+        self.turns.deal([member for stream in self._streams for member in stream.audience.members])
         for stream in tuple(self._streams):
             blocks = blocks_of.get(stream)
-            if blocks is None and not stream.has_news and not self.turns.is_next(stream):
+            is_next = any(self.turns.is_next(member) for member in stream.audience.members)
+            if blocks is None and not stream.has_news and not is_next:
                 continue
             try:
                 made[stream] = stream.drain_inbox(self._workers)
                 if blocks is not None:
                     began_s = self._time_s()
-                    stream.session.begin_block()
+                    stream.audience.begin_block()
                     # After the messages just processed, the stream may have to be rendered block by block.
                     due.append(_Due(stream, min(blocks, self._blocks_of(stream)), self._time_s() - began_s))
             except Exception:
@@ -453,12 +454,12 @@ class AudioThread:
         """Return whether a stream of the next instant is rendered together with those of this one, at the highest
         number of blocks at once: this halves the ticks, and such blocks are early anyway."""
         early_s = stream.block_s / PHASES + _EARLY_S
-        return stream.due_s <= now_s + early_s and stream.session.renderer.runs_by_itself
+        return stream.due_s <= now_s + early_s and stream.audience.runs_by_itself
 
     def _blocks_of(self, stream: Stream) -> int:
         """Return how many blocks of a stream that is due to render now."""
         count = self.blocks_at_once
-        if count == 1 or not stream.session.renderer.runs_by_itself:
+        if count == 1 or not stream.audience.runs_by_itself:
             return 1
         assert self._origin_s is not None
         since_origin = math.floor((stream.due_s - self._origin_s) / stream.block_s + 0.5 / PHASES)
@@ -467,23 +468,24 @@ class AudioThread:
     def _render(self, due: list["_Due"], made: dict[Stream, list[Outgoing]]) -> None:
         began_s = self._time_s()
         clocks = [each.stream.session.sample_clock for each in due]
-        renderers = [each.stream.session.renderer for each in due for _ in range(each.blocks)]
+        renderers_of = [each.stream.audience.renderers(each.blocks) for each in due]
+        renderers = [renderer for some in renderers_of for renderer in some]
         try:
             blocks = iter(render_all(renderers))
         except Exception:  # rendering each alone shows which one fails
             _logger.exception("%d blocks rendered together failed", len(renderers))
             for each in due:
-                if len(renderers) == 1:
+                if len(due) == 1 and each.blocks == 1:
                     self._fail(each.stream, made)
                 else:
                     self._render([each._replace(blocks=1)], made)
             return
         now_s = self._time_s()
         each_s = (now_s - began_s) / len(renderers)
-        for (stream, count, cost_s), clock in zip(due, clocks, strict=True):
-            rendered = list(islice(blocks, count))
+        for (stream, _, cost_s), clock, own in zip(due, clocks, renderers_of, strict=True):
+            rendered = list(islice(blocks, len(own)))
             try:
-                made[stream] += stream.finish_blocks(clock, rendered, cost_s=cost_s + count * each_s, now_s=now_s)
+                made[stream] += stream.finish_blocks(clock, rendered, cost_s=cost_s + len(own) * each_s, now_s=now_s)
             except Exception:
                 _logger.exception(_FAILED)
                 self._fail(stream, made)

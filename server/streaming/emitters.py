@@ -16,7 +16,8 @@ from server.protocol.client_messages import AddEmitter, MoveEmitter, StopEmitter
 from server.protocol.server_messages import LiveStatus
 from server.protocol.snapshot import KeptEmitter
 from server.rendering.convolver import PartitionedIr
-from server.rendering.sources import FADE_SAMPLES, LiveSource
+from server.rendering.ingest import DryAudio
+from server.rendering.sources import FADE_SAMPLES, FloatArray, LiveSource, SharedSource
 from server.responses.effect_flags import EmitterEffects
 from server.responses.emitter_state import EmitterState
 
@@ -102,6 +103,8 @@ class StreamedEmitter:
     added: AddEmitter | None = None
     """The client's message that added it; None outside streams."""
     live: "LiveInput | None" = None
+    clip: DryAudio | FloatArray | None = None
+    """What it plays, unless it is live."""
     stage: Stage = Stage.DECIDED
     heard: HeardResponse = field(default_factory=HeardResponse)
     is_outdated: bool = True
@@ -129,6 +132,7 @@ class StreamedEmitter:
         stage: Stage = Stage.DECIDED,
         *,
         since: int | None = None,
+        clip: DryAudio | FloatArray | None = None,
     ) -> "StreamedEmitter":
         pattern = OMNIDIRECTIONAL if message.directivity is None else message.directivity.directivity
         state = EmitterState(message.pose, pattern, EVERYTHING, message.gain_db)
@@ -137,6 +141,7 @@ class StreamedEmitter:
             state,
             message,
             live,
+            clip,
             stage,
             starts_at=message.start_at or 0,
             ends=live is None and (not message.loop or message.stop_at is not None),
@@ -228,7 +233,8 @@ class StreamedEmitter:
 
 @dataclass
 class LiveInput:
-    """The live source of emitter `id`, and the sequence number of its newest block."""
+    """The live source of emitter `id`, which all listeners of a stream share, and the sequence number of its newest
+    block."""
 
     id: str
     source: LiveSource
@@ -236,6 +242,11 @@ class LiveInput:
     blocks_lost: int = field(default=0, init=False)
     samples_concealed: int = field(default=0, init=False)
     _gated_told: int = field(default=0, init=False)
+    shared: SharedSource = field(init=False)
+    """Its source for the renderers of several listeners."""
+
+    def __post_init__(self) -> None:
+        self.shared = SharedSource(self.source)
 
     @classmethod
     def opened(

@@ -153,24 +153,26 @@ def expected_cost(
     step: QualityStep,
     *,
     emitters: int,
+    listeners: int = 1,
     correction: Correction = Correction(),
     block_sent_s: float | None = None,
     is_top: bool = False,
     is_live: bool = False,
 ) -> StreamCost:
-    """Return what a stream of a kind is expected to take on a quality step, while its listener walks."""
+    """Return what a stream of a kind is expected to take on a quality step, while its listeners walk: each of them
+    takes as much as a stream of its own would."""
     rate_hz = limits.poses_hz if step.ir_rate_hz is None else min(limits.poses_hz, step.ir_rate_hz)
     share = kind.render[step.level].share(emitters=emitters, rate_hz=rate_hz, block_s=kind.block_s)
-    new_s = emitters * step.cost_ms / 1000
+    new_s = listeners * emitters * step.cost_ms / 1000
     request_s = new_s * kind.walk.get(step.level, 1.0) * correction.requests
     return StreamCost(
-        rendering=share * correction.rendering,
-        loop=(limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
-        encoding=kind.encoding,
+        rendering=listeners * share * correction.rendering,
+        loop=listeners * (limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
+        encoding=listeners * kind.encoding,
         request_s=request_s,
         rate_hz=rate_hz,
         patience_s=patience_s(thresholds, step),
-        opening_s=new_s + limits.plan_s,
+        opening_s=new_s + listeners * limits.plan_s,
         is_top=is_top,
         is_live=is_live,
     )

@@ -11,8 +11,9 @@ from functools import partial
 from typing import Any, TypeVar
 
 from server.planning.plan import Plan
-from server.protocol.client_messages import AddEmitter, ClientMessage, ListenerPose
+from server.protocol.client_messages import MOST_LISTENERS, AddEmitter, ClientMessage, ListenerPose, RemoveListener
 from server.responses.ir_request import IrRequest, IrResponse
+from server.streaming.audience import Member, NewListener
 from server.streaming.plan_audit import Regret
 from server.streaming.quality_steps import QualityStep
 
@@ -37,7 +38,9 @@ class TakeSnapshot:
     handled: int
 
 
-StreamMessage = ClientMessage | ChosenSteps | TakeSnapshot
+_NEVER_REFUSED = TakeSnapshot | RemoveListener
+"""What the server has noted already, or asks for itself."""
+StreamMessage = ClientMessage | ChosenSteps | TakeSnapshot | NewListener
 
 
 @dataclass(frozen=True)
@@ -52,40 +55,46 @@ class Inbox:
     """The queues of one stream. An exception in place of a result means that the work failed."""
 
     def __init__(self) -> None:
-        self.responses: deque[tuple[IrRequest, ComputedResponse | BaseException]] = deque()
-        self.plans: deque[tuple[Plan, float] | BaseException] = deque()
-        """Plans, each with the CPU time that it took."""
-        self.regrets: deque[Regret | BaseException] = deque()
+        self.responses: deque[tuple[Member, IrRequest, ComputedResponse | BaseException]] = deque()
+        """Responses, each with the listener for whom it was requested."""
+        self.plans: deque[tuple[Member, tuple[Plan, float] | BaseException]] = deque()
+        """Plans, each with the listener for whom it was made and the CPU time that it took."""
+        self.regrets: deque[tuple[Member, Regret | BaseException]] = deque()
         self.brings_emitter = False
-        """Whether a waiting message adds an emitter."""
+        """Whether a waiting message adds an emitter, or a listener who hears those there are."""
         self.asks_for_state = False
         """Whether a waiting message asks for the stream's state."""
         self._messages: deque[tuple[float, StreamMessage]] = deque()
 
     def put_message(self, message: StreamMessage, now_s: float) -> bool:
         """Queue a message; return False, and refuse it, if too many of the client's are waiting. A listener's pose
-        replaces an older one directly before it, and counts from when that one arrived: the listener has waited since
-        then."""
+        replaces an older one of the same listener before it if only poses of listeners lie between, and counts from
+        when that one arrived: the listener has waited since then."""
         if not self._replace_pose(message):
-            if len(self._messages) >= MAX_WAITING_MESSAGES and not isinstance(message, TakeSnapshot):
+            if len(self._messages) >= MAX_WAITING_MESSAGES and not isinstance(message, _NEVER_REFUSED):
                 return False
             self._messages.append((now_s, message))
-        self.brings_emitter |= isinstance(message, AddEmitter)
+        self.brings_emitter |= isinstance(message, AddEmitter | NewListener)
         self.asks_for_state |= isinstance(message, TakeSnapshot)
         return True
 
     def _replace_pose(self, message: StreamMessage) -> bool:
-        if not (isinstance(message, ListenerPose) and self._messages):
+        if not isinstance(message, ListenerPose):
             return False
         try:
-            arrived_s, last = self._messages[-1]
-            if not (isinstance(last, ListenerPose) and last.pose_id < message.pose_id):
-                return False
-            # Only this method appends: if the audio thread has taken the last message meanwhile, the queue is empty.
-            self._messages[-1] = arrived_s, message
+            for place in range(-1, -1 - MOST_LISTENERS, -1):
+                arrived_s, last = self._messages[place]
+                if not isinstance(last, ListenerPose):
+                    return False
+                if (last.listener, last.index or 0) == (message.listener, message.index or 0):
+                    if last.pose_id >= message.pose_id:
+                        return False
+                    # Only this thread appends: if the audio thread has taken this message meanwhile, it is not there.
+                    self._messages[place] = arrived_s, message
+                    return True
         except IndexError:
-            return False
-        return True
+            pass
+        return False
 
     @property
     def has_messages(self) -> bool:

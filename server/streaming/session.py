@@ -1,4 +1,5 @@
-"""One listener's stream as a state machine without input, output or waiting.
+"""One listener of a stream as a state machine without input, output or waiting. Further listeners of the stream have
+sessions of their own (`server.streaming.audience`).
 
 Messages go in; messages and audio blocks come out. The direct paths of each block follow the newest poses. Reflections
 and reverberation follow later: `take_request` returns the impulse responses (IRs) to compute, and the answer comes back
@@ -11,7 +12,7 @@ A `Session` belongs to the thread that renders it. Positions are in metres, cloc
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
@@ -76,13 +77,14 @@ def _start_pose(bundle: Bundle) -> Pose:
 
 
 class Session:
-    """The state of one client's stream: poses, emitters, a renderer and the window of unacknowledged blocks.
+    """The state of one listener of a stream: poses, emitters, a renderer and the window of unacknowledged blocks.
 
     `levels` are the scene's, at any rate, and `quality` is the first one to render. The stream has the sample rate that
     the hello asks for, or the scene's own. `filters` are those of the listener's head at the stream's rate, and
     `field_filters` at the scene's, if that is another. `load_clip` returns audio at the stream's rate; it has to be
     fast, since it is called on the rendering thread. Raises RequestError for a hello that cannot be served, such as
-    unsupported_sample_rate or no_directions, and ValueError for filters of another rate.
+    unsupported_sample_rate or no_directions, and ValueError for filters of another rate. `index` is the listener's
+    number in its stream, and `listener` its pose if it is not that of the hello.
     """
 
     def __init__(
@@ -99,6 +101,8 @@ class Session:
         place: SceneAcoustics | None = None,
         costs: Callable[[int | None], Costs] = lambda _: {},
         field_filters: HeadFilters | None = None,
+        listener: Pose | None = None,
+        index: int = 0,
     ) -> None:
         require_protocol(hello)
         levels = levels.at_rate(hello.sample_rate)
@@ -113,6 +117,7 @@ class Session:
         self.ir_exchanges = 0
         self.blocks_dropped = 0
         self.blocks_limited = 0
+        self.index = index
         self._hello = hello
         self._bundle = levels.bundle
         self._sample_rate = field.sample_rate
@@ -122,8 +127,12 @@ class Session:
             levels = levels.with_directions()
         self._output = hello.output
         self._direct_sound = DirectSound.of(self._bundle, filters, order=order, field_filters=field_filters)
-        self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
-        self._bundle.require_inside(self._listener.position, "listener.position")
+        if listener is None:
+            self._listener = _start_pose(self._bundle) if hello.listener is None else hello.listener.pose
+            self._bundle.require_inside(self._listener.position, "listener.position")
+        else:
+            self._listener = listener
+            self._bundle.require_inside(listener.position, "position")
         planned = None
         if place is not None:
             scene, own = self._bundle.manifest.effects, read_overrides(hello.effects)
@@ -169,6 +178,21 @@ class Session:
     def emitter_count(self) -> int:
         """The number of emitters. Any thread may read it."""
         return len(self._emitters)
+
+    @property
+    def emitters(self) -> Mapping[str, StreamedEmitter]:
+        """The emitters by id, which nobody else changes."""
+        return self._emitters
+
+    @property
+    def listener(self) -> Pose:
+        """The newest pose of the listener."""
+        return self._listener
+
+    @property
+    def newest_pose_id(self) -> int:
+        """The id of the newest pose, of the listener or of emitters."""
+        return self._responses.newest_pose_id
 
     @property
     def quality(self) -> QualityStep:
@@ -320,7 +344,8 @@ class Session:
             if number < len(sequences):
                 place = sequences[number], clocks[number]
                 # guard: a block says that it was turned down
-                blocks.append(AudioBlock(*place, *pose_ids, samples, is_exchange=is_exchange, is_limited=is_limited))
+                flags = {"is_exchange": is_exchange, "is_limited": is_limited}
+                blocks.append(AudioBlock(*place, *pose_ids, samples, **flags, listener=self.index))
         return blocks
 
     def render_block(self) -> AudioBlock | None:
@@ -332,15 +357,28 @@ class Session:
     def follow_clock(self) -> list[ServerMessage]:
         """Note what has come to its end by the next block; remove the emitters that were to be removed then."""
         events: list[ServerMessage] = []
-        for identifier, emitter in tuple(self._emitters.items()):
-            emitter.follow_ramp(self.sample_clock)
-            if emitter.ends and self.renderer.has_ended(identifier):
-                emitter.ends = False
-                is_removed = emitter.remove_when_ended
-                events.append(EmitterEnded(id=identifier, sample_clock=self.sample_clock, removed=is_removed))
-                if is_removed:
-                    events += self._forget_emitter(identifier)
+        self.follow_ramps()
+        for identifier in tuple(self._emitters):
+            if self.has_ended(identifier):
+                events += self.end_emitter(identifier)
         return events
+
+    def follow_ramps(self) -> None:
+        """Note the gains of ramps that have come to their ends."""
+        for emitter in self._emitters.values():
+            emitter.follow_ramp(self.sample_clock)
+
+    def has_ended(self, identifier: str) -> bool:
+        """Whether an emitter's clip has been heard to its end, of which the client is not informed yet."""
+        return self._emitters[identifier].ends and self.renderer.has_ended(identifier)
+
+    def end_emitter(self, identifier: str) -> list[ServerMessage]:
+        """Note that an emitter's clip is over, and remove the emitter if it was to be removed then."""
+        emitter = self._emitters[identifier]
+        emitter.ends = False
+        is_removed = emitter.remove_when_ended
+        ended = EmitterEnded(id=identifier, sample_clock=self.sample_clock, removed=is_removed)
+        return [ended, *(self.forget_emitter(identifier) if is_removed else [])]
 
     def live_statuses(self) -> tuple[LiveStatus, ...]:
         return tuple(emitter.live.status for emitter in self._emitters.values() if emitter.live)
@@ -388,8 +426,25 @@ class Session:
                 errors.append(Error.from_refusal(refusal, kept.emitter.id))
         return errors
 
-    def _restore_emitter(self, kept: KeptEmitter) -> None:
-        self._add_emitter(kept.emitter, since=kept.since)
+    def join(self, other: "Session", quality: QualityStep, sequence: int) -> None:
+        """Begin where the session of another listener of the stream is: at its clock and quality, with its emitters,
+        which fade in where they are by now. The first block has this `sequence`."""
+        self._responses.continue_from(other.newest_pose_id)
+        self._followed_pose_id = other.newest_pose_id
+        self.continue_at(other.sample_clock, sequence)
+        for emitter in other.emitters.values():
+            self._restore_emitter(emitter.kept(), emitter)
+        self.set_quality(quality, "chosen")
+
+    def share_emitter(self, identifier: str, other: "Session") -> None:
+        """Add an emitter that the session of another listener of the stream has just added. Raises RequestError
+        too_many_emitters if earlier ones ring out in every slot."""
+        emitter = other.emitters[identifier]
+        assert emitter.added is not None
+        self._add_emitter(emitter.added, like=emitter)
+
+    def _restore_emitter(self, kept: KeptEmitter, like: StreamedEmitter | None = None) -> None:
+        self._add_emitter(kept.emitter, since=kept.since, like=like)
         identifier = kept.emitter.id
         emitter = self._emitters[identifier]
         if emitter.live is not None:
@@ -446,12 +501,16 @@ class Session:
         self._effects.unbake(message.id, emitter)
         self._follow(message.id, emitter)
 
-    def _add_emitter(self, message: AddEmitter, *, since: int | None = None) -> None:
+    def _add_emitter(
+        self, message: AddEmitter, *, since: int | None = None, like: StreamedEmitter | None = None
+    ) -> None:
+        """Add an emitter, with the sound of one that it is `like`."""
         self._bundle.require_inside(message.position, "position")
         if self._bundle.manifest.direct_sound == "field" and message.directivity is not None:
             problem = f"scene {self._bundle.id} holds the direct sound, with how its emitters beamed; leave it out"
             raise RequestError("fixed_directivity", problem, field="directivity")
-        live, source = self._open_source(message)
+        live, clip = self._open_sound(message) if like is None else (like.live, like.clip)
+        source = self._open_clip(message, clip) if clip is not None else self._tap(live)
         try:
             self.renderer.add_emitter(message.id, source, gain=float(db_to_amplitude(message.gain_db)), since=since)
         except DuplicateEmitterError as exc:
@@ -459,7 +518,7 @@ class Session:
         except RendererFullError as exc:
             raise RequestError("too_many_emitters", str(exc)) from exc
         stage = Stage.DECIDED if self._effects.planned is None else Stage.UNDECIDED
-        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage, since=since)
+        emitter = StreamedEmitter.added_by(message, self._next_serial, live, stage, since=since, clip=clip)
         if emitter.state.directivity != OMNIDIRECTIONAL:
             self.renderer.set_reverberation_gain(message.id, reverberation_gain(emitter.state.directivity))
         self._emitters[message.id] = emitter
@@ -467,16 +526,21 @@ class Session:
         self._next_serial += 1
         self._responses.retry()
 
-    def _open_source(self, message: AddEmitter) -> tuple[LiveInput | None, Source]:
+    def _open_sound(self, message: AddEmitter) -> tuple[LiveInput | None, DryAudio | FloatArray | None]:
         if message.clip is not None:
-            return None, self._open_clip(message, self._load_clip(message.clip))
+            return None, self._load_clip(message.clip)
         live = LiveInput.opened(
             message.id,
             sample_rate=self._sample_rate,
             block_size=self.renderer.block_size,
             jitter_ms=message.jitter_ms,
         )
-        return live, live.source
+        return live, None
+
+    def _tap(self, live: LiveInput | None) -> Source:
+        assert live is not None, "an emitter plays a clip or is live"
+        renderer = self.renderer
+        return live.shared.tap(lambda: renderer.sample_clock)
 
     def _open_clip(self, message: AddEmitter, clip: DryAudio | FloatArray) -> ClipPlayer:
         """Raises RequestError outside_clip."""
@@ -534,9 +598,10 @@ class Session:
 
     def _remove_emitter(self, message: RemoveEmitter) -> list[ServerMessage]:
         self._require_emitter(message.id)
-        return [EmitterRemoved(id=message.id), *self._forget_emitter(message.id)]
+        return [EmitterRemoved(id=message.id), *self.forget_emitter(message.id)]
 
-    def _forget_emitter(self, identifier: str) -> list[ServerMessage]:
+    def forget_emitter(self, identifier: str) -> list[ServerMessage]:
+        """Remove an emitter without a word to the client."""
         del self._emitters[identifier]
         if self._effects.planned is not None:
             self._effects.planned.forget_emitter(identifier)

@@ -1,4 +1,5 @@
-"""A session in time: when its blocks are due, what waits in its inbox, and how long its work takes.
+"""The listeners of a stream in time: when their blocks are due, what waits in their inbox, and how long their work
+takes.
 
 A stream whose window stays full is *paused*: nothing is rendered, and its sample clock stands still. Both continue from
 there with the first acknowledgement that makes room.
@@ -24,6 +25,7 @@ from server.protocol.snapshot import Snapshot
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
+from server.streaming.audience import Audience, Member, NewListener
 from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, PendingWork, StreamMessage, TakeSnapshot
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
@@ -32,7 +34,7 @@ from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.request_queue import RequestQueue
 from server.streaming.response_scheduler import Scope
 from server.streaming.session import Session
-from server.streaming.stream_times import ResponseWait, StreamTimes
+from server.streaming.stream_times import StreamTimes
 
 PAUSE_AFTER_S = 1.0
 """How long a window may be full before rendering stops. If the network stalls for less, only the blocks without room in
@@ -76,8 +78,6 @@ Outgoing = ServerMessage | TimedBlock | StreamFailed | StreamState
 class CpuCosts:
     """Smoothed CPU times, in seconds, of work for a stream."""
 
-    request_s: float = 0.0
-    """CPU time of a request for impulse responses."""
     plan_s: float = 0.0
     """CPU time of a plan of effects."""
 
@@ -109,8 +109,8 @@ class Pause:
 
 
 class Stream:
-    """A session with its clock, inbox and load. `ladder` is its position among the levels on `offer`. `deliver` is
-    called on the event loop with the stream's output, in order."""
+    """The listeners of a stream with their clock, inbox and load: `session` is that of the first one. `ladder` is their
+    position among the levels on `offer`. `deliver` is called on the event loop with the stream's output, in order."""
 
     def __init__(
         self,
@@ -130,6 +130,8 @@ class Stream:
         self.blocks_late = 0
         """Late blocks, counted by the sender, since only it knows when they left."""
         self.times = StreamTimes()
+        """Of the blocks of all listeners, and of the poses and responses of the first."""
+        self.audience = Audience(session, self.times)
         self.regrets = RegretRecord()
         self.load = 0.0
         """Smoothed share of a core that its blocks take."""
@@ -140,11 +142,6 @@ class Stream:
         self.next_block = 0
         self.due_s = math.inf
         """When the next block should be rendered; infinite before the start and in a pause."""
-        self.wants_turn = False
-        """Whether the stream waits for its turn to request impulse responses."""
-        self.asked_last_s = -math.inf
-        self._has_asked = False
-        self._wait = ResponseWait()
         self._costs = CpuCosts()
         self.shown = ShownCost()
         self._request_cpu_s = 0.0
@@ -170,6 +167,12 @@ class Stream:
         self._next_check_s: float | None = FIRST_S
         """Seconds of sound at which the next check of a plan is due; None during a check."""
         self._next_status_s = 1.0
+        self._checks = 0
+
+    @property
+    def levels(self) -> FieldsByLevel:
+        """The levels of its scene, at its sample rate."""
+        return self._levels
 
     @property
     def scene(self) -> str:
@@ -183,7 +186,7 @@ class Stream:
     @property
     def awaits_irs_since_s(self) -> float | None:
         """Since when the stream waits for impulse responses; None if it does not."""
-        return self._wait.since_s
+        return min((since for each in self.audience.members if (since := each.wait.since_s) is not None), default=None)
 
     @property
     def stalled_s(self) -> float:
@@ -257,12 +260,17 @@ class Stream:
     @property
     def _asks_at_once(self) -> bool:
         """Whether the stream may request IRs at once: turns are left, or a new emitter needs its first IR."""
-        return not self.session.awaits_irs and (self._inbox.brings_emitter or self._turns.are_left)
+        return not self.audience.awaits_irs and (self._inbox.brings_emitter or self._turns.are_left)
 
     @property
     def is_unanswered(self) -> bool:
         """Whether a request for impulse responses is unanswered."""
-        return self._has_asked and not self._inbox.responses
+        return any(member.is_unanswered for member in self.audience.members)
+
+    @property
+    def wants_turn(self) -> bool:
+        """Whether a listener waits for its turn to request impulse responses."""
+        return any(member.wants_turn for member in self.audience.members)
 
     def drain_inbox(self, workers: Workers) -> list[Outgoing]:
         """Process the inbox and request impulse responses; if it is not the stream's turn, set `wants_turn`."""
@@ -272,21 +280,26 @@ class Stream:
         while inbox.responses:
             outgoing += self._take_answer(*inbox.responses.popleft())
         while inbox.plans:
-            outgoing += self._take_plan(inbox.plans.popleft())
+            outgoing += self._take_plan(*inbox.plans.popleft())
         for arrived_s, message in inbox.take_messages():
             if isinstance(message, TakeSnapshot):
                 outgoing.append(self._state(message))
                 continue
             if isinstance(message, SetLevel | ChosenSteps):
                 refused = self._choose(message)
+            elif isinstance(message, NewListener):
+                refused = [self.audience.join(message, self.ladder.step)]
             else:
-                refused = self.session.receive(message)
-            if isinstance(message, ListenerPose | MoveEmitter) and not refused:
-                self.times.arrive(message.pose_id, arrived_s)
+                refused = self.audience.receive(message)
+            if isinstance(message, ListenerPose) and not refused:
+                self.audience.member_of(message).times.arrive(message.pose_id, arrived_s)
+            elif isinstance(message, MoveEmitter) and not refused:
+                for member in self.audience.members:
+                    member.times.arrive(message.pose_id, arrived_s)
             outgoing += refused
         while inbox.regrets:
-            self._take_regret(inbox.regrets.popleft())
-        if self._pause.full_since_s is not None and not self.session.window.is_full:
+            self._take_regret(*inbox.regrets.popleft())
+        if self._pause.full_since_s is not None and not self.audience.has_no_room:
             self._resume()
         if not self._pause.is_paused:
             self._call_for_work(workers)
@@ -295,24 +308,26 @@ class Stream:
     def _call_for_work(self, workers: Workers) -> None:
         self._check_plan(workers)
         # New emitters wait for a plan to become audible, so it is urgent; for others it only improves the effects.
-        if (wanted := self.session.take_plan_request()) is not None:
-            plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
-            self._pending.keep_outcome(plan, self._keep_plan)
-        self._ask(workers)
+        for member in self.audience.members:
+            if (wanted := member.session.take_plan_request()) is not None:
+                plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
+                self._pending.keep_outcome(plan, partial(self._keep_plan, member))
+            self._ask(workers, member)
 
-    def _ask(self, workers: Workers) -> None:
-        """Request the impulse responses for the newest poses if it is the stream's turn, or else the first ones of
+    def _ask(self, workers: Workers, member: Member) -> None:
+        """Request the impulse responses for the newest poses if it is a listener's turn, or else the first ones of
         emitters."""
-        request = self.session.take_request(Scope.ALL if self._turns.may_ask(self) else Scope.FIRST)
-        self.wants_turn = self.session.wants_irs
+        session = member.session
+        request = session.take_request(Scope.ALL if self._turns.may_ask(member) else Scope.FIRST)
+        member.wants_turn = session.wants_irs
         if request is not None:
-            self._has_asked, self.asked_last_s = True, self._time_s()
-            self._turns.note(self)
+            member.has_asked, member.asked_last_s = True, self._time_s()
+            self._turns.note(member)
             answer = workers.submit(
-                _compute_timed, self._levels, request, self.session, kind="response", is_urgent=request.is_first
+                _compute_timed, self._levels, request, session, kind="response", is_urgent=request.is_first
             )
-            self._pending.keep_outcome(answer, partial(self._keep_answer, request))
-        self._wait.note(self._has_asked or self.wants_turn, self._time_s())
+            self._pending.keep_outcome(answer, partial(self._keep_answer, member, request))
+        member.wait.note(member.has_asked or member.wants_turn, self._time_s())
 
     def leave(self) -> None:
         """Cancel all work requested by this stream."""
@@ -320,13 +335,13 @@ class Stream:
 
     @property
     def request_s(self) -> float:
-        """The smoothed CPU time of a request for impulse responses; 0 before the first answer."""
-        return self._costs.request_s
+        """The smoothed CPU time of a request for impulse responses of every listener; 0 before the first answer."""
+        return sum(member.request_s for member in self.audience.members)
 
     def note_cost(self, *, period_s: float, saving: float, memory: float) -> None:
         """Note what the stream took in the last `period_s`, in which its blocks took the share `saving` of what they
         take one at a time."""
-        self.shown.is_live = not self.session.renderer.runs_by_itself
+        self.shown.is_live = not self.audience.runs_by_itself
         rendering = self.load / (1.0 if self.shown.is_live else saving)
         responses, self._request_cpu_s = self._request_cpu_s / period_s, 0.0
         self.shown.note(rendering=rendering, responses=responses, memory=memory)
@@ -336,7 +351,9 @@ class Stream:
         lateness_s = max(self._worst_lateness_s, self._worst_sent_s)
         self._worst_lateness_s = self._worst_sent_s = 0.0
         lateness = lateness_s / (self._lead * self.block_s)
-        return LoadSample(lateness, self._wait.take_longest_s(now_s), self._costs.request_s, self._costs.plan_s)
+        waits_s = [member.wait.take_longest_s(now_s) for member in self.audience.members]
+        longest_s = max((wait_s for wait_s in waits_s if wait_s is not None), default=None)
+        return LoadSample(lateness, longest_s, self.request_s, self._costs.plan_s)
 
     def note_sent(self, deadline_s: float, now_s: float) -> bool:
         """Note that a block is sent now; return whether it is late. The sender calls this: a block that is ready in
@@ -348,27 +365,40 @@ class Stream:
 
     def follow_ladder(self, reason: LevelReason, now_s: float) -> list[Outgoing]:
         """Set the session to the present step of the ladder, which has been moved."""
-        self._wait.restart(now_s)  # earlier requests do not show how the new step performs
-        return [*self.session.set_quality(self.ladder.step, reason)]
+        self._restart_waits(now_s)
+        return [*self.audience.set_quality(self.ladder.step, reason)]
+
+    def _restart_waits(self, now_s: float) -> None:
+        """Forget how long earlier requests took, which do not show how a new step performs."""
+        for member in self.audience.members:
+            member.wait.restart(now_s)
 
     def set_intervals(self, ir_s: float, plan_s: float) -> None:
         """Set the least time between requests for IRs, and between plans of effects."""
-        self.session.space_plans(plan_s)
-        self.session.set_ir_interval(ir_s)
+        for member in self.audience.members:
+            member.session.space_plans(plan_s)
+            member.session.set_ir_interval(ir_s)
 
     def finish_blocks(
         self, sample_clock: int, rendered: Sequence[Rendered], *, cost_s: float, now_s: float
     ) -> list[Outgoing]:
-        """Return the blocks just rendered together, which took `cost_s` and are ready at `now_s`, with messages that
-        are due."""
-        clock, count = self.clock, len(rendered)
-        blocks = self.session.finish_blocks(sample_clock, rendered)
+        """Return the blocks just rendered together, equally many of each listener and one listener after the other.
+        They took `cost_s` and are ready at `now_s`. Messages that are due come with them."""
+        clock, members = self.clock, self.audience.members
+        count = len(rendered) // len(members)
+        made: list[list[AudioBlock]] = []
+        for place, member in enumerate(members):
+            blocks = member.session.finish_blocks(sample_clock, rendered[place * count : (place + 1) * count])
+            made.append(blocks)
+            if blocks:
+                member.times.pose.take_effect(blocks[0].pose_id, now_s)
+                member.times.reverberation.take_effect(blocks[0].reverberation_pose_id, now_s)
         outgoing: list[Outgoing] = [
-            TimedBlock(block, clock.deadline_s(number)) for number, block in enumerate(blocks, self.next_block)
+            TimedBlock(blocks[number], clock.deadline_s(self.next_block + number))
+            for number in range(count)
+            for blocks in made
+            if number < len(blocks)
         ]
-        if blocks:
-            self.times.pose.take_effect(blocks[0].pose_id, now_s)
-            self.times.reverberation.take_effect(blocks[0].reverberation_pose_id, now_s)
         each_s = cost_s / count
         self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
         self.times.render.add(each_s, count)
@@ -383,13 +413,13 @@ class Stream:
             clock.slip(self.next_block, now_s)
         self.next_block += count
         self.due_s = clock.due_s(self.next_block)
-        if len(blocks) < count:
+        if all(len(blocks) < count for blocks in made):
             self._note_full(now_s)
-        outgoing += self.session.follow_clock()
+        outgoing += self.audience.follow_clock()
         if self.next_block * self.block_s >= self._next_status_s:
             self._next_status_s += 1.0
             outgoing += self.session.complaints()
-            outgoing.append(self._status(now_s))
+            outgoing += [self._status(member, now_s) for member in members]
         return outgoing
 
     def _note_full(self, now_s: float) -> None:
@@ -397,8 +427,9 @@ class Stream:
             self._pause.full_since_s = now_s
         elif now_s - self._pause.full_since_s >= PAUSE_AFTER_S:
             self._pause.is_paused, self.due_s = True, math.inf
-            self.wants_turn = False
-            self._wait.note(False, now_s)
+            for member in self.audience.members:
+                member.wants_turn = False
+                member.wait.note(False, now_s)
 
     def _resume(self) -> None:
         """End a pause, since there is room again: the next block is due now instead of at its old time."""
@@ -416,16 +447,17 @@ class Stream:
             return [Error.from_refusal(refusal)]
         self.ladder = Ladder(chosen.steps, chosen.at)
         self.session.chosen_level = chosen.level
-        self._wait.restart(self._time_s())
-        return self.session.set_quality(self.ladder.step, "chosen")
+        self._restart_waits(self._time_s())
+        return self.audience.set_quality(self.ladder.step, "chosen")
 
     def _state(self, asked: TakeSnapshot) -> StreamState:
         # In a pause the clock stands still, while the sound that is lost would have gone on.
-        snapshot = self.session.snapshot(session=asked.session, handled=asked.handled)
+        snapshot = self.audience.snapshot(session=asked.session, handled=asked.handled)
         return StreamState(snapshot, self.deadline_s)
 
-    def _keep_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> None:
-        self._inbox.responses.append((request, computed))
+    def _keep_answer(self, member: Member, request: IrRequest, computed: ComputedResponse | BaseException) -> None:
+        self._inbox.responses.append((member, request, computed))
+        member.is_answered = True
         self._wake()
 
     def _check_plan(self, workers: Workers) -> None:
@@ -433,15 +465,17 @@ class Stream:
         if self._next_check_s is None or clock_s < self._next_check_s:
             return
         self._next_check_s = clock_s + PERIOD_S
-        if (check := self.session.take_check()) is not None:
+        self._checks += 1
+        member = self.audience.members[self._checks % len(self.audience.members)]
+        if (check := member.session.take_check()) is not None:
             self._next_check_s = None
             regret = workers.submit(check.run, self._levels[check.level], kind="plan")
-            self._pending.keep_outcome(regret, self._keep_regret)
+            self._pending.keep_outcome(regret, partial(self._keep_regret, member))
 
-    def _keep_regret(self, regret: Regret | BaseException) -> None:
-        self._inbox.regrets.append(regret)  # processed with the next block
+    def _keep_regret(self, member: Member, regret: Regret | BaseException) -> None:
+        self._inbox.regrets.append((member, regret))  # processed with the next block
 
-    def _take_regret(self, regret: Regret | BaseException) -> None:
+    def _take_regret(self, member: Member, regret: Regret | BaseException) -> None:
         clock_s = self.next_block * self.block_s
         self._next_check_s = clock_s + PERIOD_S
         if isinstance(regret, BaseException):
@@ -449,33 +483,37 @@ class Stream:
             return
         self._next_check_s = clock_s + interval_s(regret.cost_s, streams=self.company)
         self.regrets.add(regret)
-        self.session.learn(regret)
+        member.session.learn(regret)
 
-    def _keep_plan(self, planned: tuple[Plan, float] | BaseException) -> None:
-        self._inbox.plans.append(planned)
+    def _keep_plan(self, member: Member, planned: tuple[Plan, float] | BaseException) -> None:
+        self._inbox.plans.append((member, planned))
         self._wake()
 
-    def _take_plan(self, planned: tuple[Plan, float] | BaseException) -> list[ServerMessage]:
+    def _take_plan(self, member: Member, planned: tuple[Plan, float] | BaseException) -> list[ServerMessage]:
+        if member not in self.audience.members:
+            return []  # it has left
         if isinstance(planned, BaseException):
             _logger.error("no plan of effects", exc_info=planned)
-            return self.session.keep_effects()
+            return self.audience.keep_effects(member)
         plan, cpu_s = planned
         self._costs.plan_s = _smoothed(self._costs.plan_s, cpu_s)
-        return self.session.adopt(plan)
+        return self.audience.adopt(member, plan)
 
-    def _take_answer(self, request: IrRequest, computed: ComputedResponse | BaseException) -> list[ServerMessage]:
-        self._has_asked = False
-        self._wait.end(self._time_s())
+    def _take_answer(
+        self, member: Member, request: IrRequest, computed: ComputedResponse | BaseException
+    ) -> list[ServerMessage]:
+        member.has_asked = member.is_answered = False
+        member.wait.end(self._time_s())
         if isinstance(computed, BaseException):
             _logger.error("no impulse response for pose %d", request.pose_id, exc_info=computed)
-            return self.session.give_up(request)
-        self.times.response.add(computed.duration_s)
-        self._costs.request_s = _smoothed(self._costs.request_s, computed.cpu_s)
+            return self.audience.give_up(member, request) if member in self.audience.members else []
+        member.times.response.add(computed.duration_s)
+        member.request_s = _smoothed(member.request_s, computed.cpu_s)
         self._request_cpu_s += computed.cpu_s
-        return self.session.accept(computed.response)
+        return self.audience.accept(member, computed.response) if member in self.audience.members else []
 
-    def _status(self, now_s: float) -> Status:
-        session = self.session
+    def _status(self, member: Member, now_s: float) -> Status:
+        session, times = member.session, member.times
         return Status(
             sample_clock=session.sample_clock,
             blocks_sent=session.window.sent,
@@ -485,14 +523,15 @@ class Stream:
             buffer_ms=round(self.clock.ahead_s(self.next_block, now_s) * 1000, 3),
             render_ms=Durations.of(self.times.render),
             lateness_ms=Durations.of(self.times.lateness),
-            ir_ms=Durations.of(self.times.response),
-            pose_ms=Durations.of(self.times.pose.durations),
-            reverberation_ms=Durations.of(self.times.reverberation.durations),
+            ir_ms=Durations.of(times.response),
+            pose_ms=Durations.of(times.pose.durations),
+            reverberation_ms=Durations.of(times.reverberation.durations),
             ir_exchanges=session.ir_exchanges,
             blocks_limited=session.blocks_limited,
             level=session.quality.level,
             ir_rate_hz=session.quality.ir_rate_hz,
-            live=session.live_statuses(),
+            live=session.live_statuses() if member is self.audience.first else (),
+            listener=member.id,
         )
 
 

@@ -46,6 +46,14 @@ class StreamTimes:
         self.pose.arrive(pose_id, now_s)
         self.reverberation.arrive(pose_id, now_s)
 
+    def merge(self, other: "StreamTimes") -> None:
+        """Add the durations of others."""
+        self.render.merge(other.render)
+        self.lateness.merge(other.lateness)
+        self.response.merge(other.response)
+        self.pose.durations.merge(other.pose.durations)
+        self.reverberation.durations.merge(other.reverberation.durations)
+
 
 class ResponseWait:
     """Waiting times for impulse responses, from when they are needed to their answer; waiting for a turn counts."""

@@ -7,7 +7,7 @@ from server.api.block_encoding import BlockEncoding
 from server.protocol.blocks import AudioBlock
 from server.protocol.opus import OpusOptions
 from server.protocol.packets import BlockEncoder
-from server.protocol.server_messages import EmitterRemoved
+from server.protocol.server_messages import EmitterRemoved, ListenerRemoved
 from server.streaming.stream import StreamFailed, TimedBlock
 
 SIZE = 256
@@ -31,7 +31,7 @@ def jobs():
 def encoding(jobs, heard, capacity=100):
     encoder = BlockEncoder(OpusOptions(), channels=2, sample_rate=24_000)
     return BlockEncoding(
-        encoder, jobs, block_s=SIZE / 24_000, capacity=capacity, post=jobs.append, deliver=heard.extend
+        lambda: encoder, jobs, block_s=SIZE / 24_000, capacity=capacity, post=jobs.append, deliver=heard.extend
     )
 
 
@@ -89,6 +89,31 @@ def test_a_loop_that_is_closed_meanwhile_is_nobodys_fault(jobs):
         raise RuntimeError("Event loop is closed")
 
     encoder = BlockEncoder(OpusOptions(), channels=2, sample_rate=24_000)
-    encoded = BlockEncoding(encoder, jobs, block_s=0.01, capacity=9, post=closed, deliver=print)
+    encoded = BlockEncoding(lambda: encoder, jobs, block_s=0.01, capacity=9, post=closed, deliver=print)
     encoded.put([timed(0)])
     jobs.work()
+
+
+def test_each_listener_has_an_encoder_of_its_own_until_it_leaves(jobs):
+    heard, made = [], []
+
+    def new_encoder():
+        made.append(BlockEncoder(OpusOptions(), channels=2, sample_rate=24_000))
+        return made[-1]
+
+    encoded = BlockEncoding(
+        new_encoder, jobs, block_s=SIZE / 24_000, capacity=100, post=jobs.append, deliver=heard.extend
+    )
+
+    def of(listener, number):
+        block = timed(number)
+        block.block.listener = listener
+        return block
+
+    sent = [of(0, 0), of(1, 0), of(0, 1), of(1, 1), ListenerRemoved(id="a", index=1), of(0, 2), of(1, 2)]
+    encoded.put(sent)
+    jobs.work()
+    assert heard == sent
+    assert len(made) == 3
+    restarts = [each.packets.is_restart for each in heard if isinstance(each, TimedBlock)]
+    assert restarts == [True, True, False, False, False, True]

@@ -5,6 +5,7 @@ import threading
 import pytest
 
 from server.api.stream_counts import StreamLedger
+from server.streaming.audience import Audience
 from server.streaming.plan_audit import Regret, RegretRecord
 from server.streaming.stream_times import StreamTimes
 
@@ -22,6 +23,10 @@ class Counting:
 
     def count(self, blocks):
         self.times.render.add(0.0001, blocks)
+
+    @property
+    def audience(self):
+        return Audience(self, self.times)
 
     @property
     def regrets(self):

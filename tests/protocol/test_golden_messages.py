@@ -40,6 +40,13 @@ OF_CLIENTS = [
     '{"type": "listener", "position": [2, 2, 1.5], "yaw": -1.25, "pose_id": 9}',
     '{"type": "listener", "position": [2, 2, 1.5], "orientation": [0, 0.6, 0, 0.8], "pose_id": 10}',
     '{"type": "acknowledge", "sequence": 12}',
+    '{"type": "hello", "protocol": 3, "scene": "flat", "listeners": 4}',
+    '{"type": "add_listener", "id": "p2", "position": [2, 2, 1.5], "yaw": 0.5, "hrtf": "kemar"}',
+    '{"type": "add_listener", "id": "p2", "position": [2, 2, 1.5], "orientation": [0, 0, 0, 1]}',
+    '{"type": "remove_listener", "id": "p2"}',
+    '{"type": "listener", "position": [2, 2, 1.5], "yaw": -1.25, "pose_id": 9, "listener": "p2"}',
+    '{"type": "listener", "position": [2, 2, 1.5], "pose_id": 9, "index": 1}',
+    '{"type": "acknowledge", "sequence": 12, "listener": "p2"}',
     '{"type": "ping", "id": 5}',
 ]
 _SCENE = (
@@ -80,6 +87,13 @@ OF_THE_SERVER = [
     ' "ir_rate_hz": null, "live": [{"id": "a", "samples_queued": 1, "samples_dropped": 2, "samples_gated": 3,'
     ' "samples_concealed": 4, "underruns": 5}]}',
     '{"type": "pong", "id": 3}',
+    _WELCOME[:-1] + ', "max_listeners": 8, "resumed": {"sample_clock": 4096, "sequence": 8, "pose_id": 3, "handled": 2,'
+    ' "listeners": [{"id": "p2", "index": 1}]}}',
+    '{"type": "listener_added", "id": "p2", "index": 1, "hrtf": "kemar", "sample_clock": 6144}',
+    '{"type": "listener_removed", "id": "p2", "index": 1}',
+    '{"type": "level_changed", "level": "fast", "reason": "load", "ir_rate_hz": 5.0, "shared_tail": true,'
+    ' "sample_clock": 512, "listener": "p2"}',
+    '{"type": "error", "code": "unknown_listener", "message": "no", "field": "listener", "listener": "p2"}',
     '{"type": "error", "code": "server_busy", "message": "no room", "field": null, "retry_after_s": 9,'
     ' "level": "fast"}',
     '{"type": "error", "code": "stale_pose", "message": "older than the newest", "field": "pose_id", "emitter": "a"}',
@@ -207,6 +221,35 @@ def test_an_audio_block_in_opus_is_read():
     for length in set(range(len(AUDIO_OPUS))) - between:
         with pytest.raises(ValueError):
             AudioBlock.parse_packets(AUDIO_OPUS[:length])
+
+
+def test_a_pose_and_a_block_of_another_listener_differ_in_one_byte():
+    theirs = POSE[:1] + bytes([7]) + POSE[2:]
+    pose = parse_client_message(theirs)
+    assert (pose.index, pose.pose_id, pose.listener) == (7, 9, None)
+    assert pose.serialize_binary() == theirs
+    theirs = AUDIO_F32[:3] + bytes([7]) + AUDIO_F32[4:]
+    block = AudioBlock.parse(theirs, "f32")
+    assert (block.listener, block.samples.shape, block.sequence) == (7, (2, 2), 5)
+    assert block.serialize("f32") == theirs
+    assert AudioBlock.parse(AUDIO_F32, "f32").listener == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ('{"type": "listener", "position": [2, 2, 1], "pose_id": 9, "listener": "a", "index": 1}', "malformed_message"),
+        ('{"type": "listener", "position": [2, 2, 1], "pose_id": 9, "listener": 7}', "malformed_message"),
+        ('{"type": "listener", "position": [2, 2, 1], "pose_id": 9, "index": 256}', "malformed_message"),
+        ('{"type": "acknowledge", "sequence": 1, "listener": ""}', "malformed_message"),
+        ('{"type": "add_listener", "id": "p2", "position": [2, 2]}', "malformed_pose"),
+        ('{"type": "hello", "protocol": 3, "scene": "flat", "listeners": 0}', "malformed_message"),
+    ],
+)
+def test_what_says_no_listener_is_refused_by_code(text, code):
+    with pytest.raises(RequestError) as caught:
+        parse_client_message(text)
+    assert caught.value.code == code
 
 
 def test_the_blocks_here_are_of_every_kind():

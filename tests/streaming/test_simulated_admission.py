@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from server.streaming.headroom import LIMITS
-from tests.streaming.simulated_server import SimulatedServer
+from tests.streaming.simulated_server import BLOCK_S, SimulatedServer
 
 END_S = 30.0
 CORES = {
@@ -129,3 +129,33 @@ def test_a_place_that_is_held_counts_as_its_stream_until_it_is_given_back():
     assert (admission.streams, admission.held) == (streams - 1, 1)
     admission.leave(lost)
     assert (admission.streams, admission.held, admission.load().streams) == (streams - 2, 0, streams - 2)
+
+
+def test_a_listener_counts_as_much_as_a_stream_and_is_refused_where_one_would_break_the_sound():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    (client,) = server.arrive(1, at_s=1.0)
+    server.run(3.0)
+    admission, place = server.admission, client.place
+    before = admission.load().threads[0].ahead
+    assert admission.add_listener(place) is None
+    assert admission.load().threads[0].ahead >= 1.5 * before
+    admission.remove_listener(place)
+    place.seats = 1
+    assert admission.load().threads[0].ahead == pytest.approx(before)
+    server.arrive(20, at_s=4.0, every_s=0.02)
+    server.run(6.0)
+    refused = next(found for _ in range(20) if (found := admission.add_listener(place)) is not None)
+    assert refused.error.code == "server_busy"
+    assert refused.retry_after_s >= 1
+    assert sum(count for (asked, _), count in admission.refusals.items() if asked == "add_listener") == 1
+
+
+def test_listeners_that_a_hello_announces_have_room_kept_for_them():
+    server = SimulatedServer(speeds=CORES["two cores"], admits=True)
+    steps = server._offer.steps("auto", block_s=BLOCK_S)
+    admission = server.admission
+    one = admission.admit(server._kind, steps, 8)
+    single = admission.load().threads[0].ahead
+    admission.leave(one)
+    admission.admit(server._kind, steps, 8, listeners=3)
+    assert admission.load().threads[0].ahead == pytest.approx(3 * single)
