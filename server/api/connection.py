@@ -424,6 +424,8 @@ class Connection:
         self._roster = Roster(host.settings.max_listeners)
         self._window = 0
         """Blocks of a listener that may be unacknowledged."""
+        self._allowed = 1
+        """The most listeners for whose messages the client has had an allowance."""
         self._session = ""
         self._token: str | None = None
         self._is_confirmed = False
@@ -528,6 +530,7 @@ class Connection:
                 stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)
             if stream is None or isinstance(stream, Goodbye):
                 return stream
+            place.listeners = len(stream.audience.members)
             host.admission.open(place, stream)
             return await self._pump(stream, hello, place)
         finally:
@@ -903,8 +906,7 @@ class Connection:
     async def _read_incoming(self, stream: Stream, hello: Hello) -> None:
         """Handle incoming messages until the client has gone."""
         if self._fast_path is not None:
-            emitters = self._host.settings.max_emitters
-            self._fast_path.allow(Allowance.of(emitters=emitters, sample_rate=stream.sample_rate))
+            self._allow_for(stream)
             self._fast_path.listen(self._handle_at_once)
         with contextlib.suppress(WebSocketDisconnect):
             while True:
@@ -973,7 +975,17 @@ class Connection:
         except RequestError:
             self._roster.leave(message.id)
             raise
+        if len(self._roster) > self._allowed:
+            self._allow_for(stream)
         _logger.info("listener added", extra={"listener": message.id, "index": number, "hrtf": new.hrtf})
+
+    def _allow_for(self, stream: Stream) -> None:
+        """Let the client send as much as it may with its present listeners; this fills its budget up, so it happens
+        once for each number of them."""
+        self._allowed = len(self._roster)
+        if self._fast_path is not None:
+            allowed = {"emitters": self._host.settings.max_emitters, "listeners": self._allowed}
+            self._fast_path.allow(Allowance.of(**allowed, sample_rate=stream.sample_rate))
 
     def _remove_listener(self, message: RemoveListener, place: Place) -> None:
         """Raises RequestError unknown_listener."""

@@ -9,7 +9,7 @@ event loop of a busy EPYC core an acknowledgement took 10 us, a ping with its po
 24 and a refused pose 26. A pose directly followed by a newer one took 2 us and counts as an eighth. A live block took
 17 us but counts as half, since a client with sixteen instruments sends thousands of them; at full cost the budget would
 have to allow twice as many of all other messages. The budget allows, for every emitter, live blocks of 128 samples and
-120 moves a second, and also 1,000 poses a second and an acknowledgement of every block of 128 samples.
+120 moves a second, and for every listener 1,000 poses a second and an acknowledgement of every block of 128 samples.
 """
 
 import re
@@ -49,10 +49,10 @@ class Allowance:
     bytes_per_s: float
 
     @classmethod
-    def of(cls, *, emitters: int, sample_rate: int) -> Self:
-        """The allowance of a client with this many emitters, all of them live."""
+    def of(cls, *, emitters: int, sample_rate: int, listeners: int = 1) -> Self:
+        """The allowance of a client with this many emitters, all of them live, and listeners, all of whom walk."""
         blocks_per_s = sample_rate / _SHORTEST_BLOCK
-        others_per_s = POSES_PER_S + blocks_per_s + MOVES_PER_S * emitters
+        others_per_s = listeners * (POSES_PER_S + blocks_per_s) + MOVES_PER_S * emitters
         live_per_s = emitters * blocks_per_s
         samples_bytes_per_s = emitters * sample_rate * _BYTES_PER_SAMPLE
         return cls(

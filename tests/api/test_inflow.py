@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.api.inflow import USUAL, Allowance, Budget, message_cost, supersedes
+from server.api.inflow import POSES_PER_S, USUAL, Allowance, Budget, message_cost, supersedes
 from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.client_messages import Acknowledge, ListenerPose, MoveEmitter, Ping
 
@@ -128,3 +128,10 @@ def test_nothing_else_gives_way_or_makes_others_give_way(other):
 def test_the_usual_allowance_is_that_of_sixteen_live_emitters():
     """375 blocks a second: half of 6,000 for live ones, 1,000 poses, 375 acknowledgements, 1,920 moves."""
     assert USUAL.messages_per_s == 6_295
+
+
+def test_every_listener_may_walk_and_acknowledge():
+    one, three = (Allowance.of(emitters=2, sample_rate=24_000, listeners=count) for count in (1, 3))
+    more = three.messages_per_s - one.messages_per_s
+    assert more == pytest.approx(2 * (POSES_PER_S + 24_000 / 128))
+    assert three.bytes_per_s > one.bytes_per_s

@@ -28,8 +28,6 @@ from server.protocol.server_messages import (
 from server.streaming.admission import Refusal
 from tests.api.test_stream import client, clip_files  # noqa: F401  fixtures
 
-pytestmark = pytest.mark.timed
-
 HELLO = Hello(protocol=PROTOCOL, scene="flat", listeners=3)
 NEAR, FAR = (2.0, 3.2, 1.5), (7.0, 1.0, 1.5)
 TALKER = AddEmitter(id="talker", clip="tone", position=(2.0, 3.0, 1.5))
@@ -187,5 +185,7 @@ def test_a_resumed_stream_has_its_three_listeners_again(client):  # noqa: F811
         resumed.loudness()
         heard = resumed.loudness()
         assert min(heard.values()) > 0
+        (place,) = client.app_state["host"].admission._places
+        assert place.listeners == 3
         assert resumed.refused(AddListener(id="guest", position=FAR)).code == "duplicate_listener"
         assert resumed.add("fourth").index == 3

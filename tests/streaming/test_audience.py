@@ -329,7 +329,9 @@ def test_a_snapshot_has_all_listeners_and_restores_them(room, field, filters):
     for identifier in (None, "guest", "third"):
         expected = room.of(identifier)[:, 6 * 256 :]
         loudest = np.abs(expected[:, 35 * 256 :]).max()
-        assert_allclose(again.of(identifier)[:, 35 * 256 :], expected[:, 35 * 256 :], atol=2e-4 * loudest)
+        # Who has walked keeps filters of a place just before, from which the new ones do not differ audibly.
+        limit = 2e-3 if identifier == "guest" else 1e-5
+        assert_allclose(again.of(identifier)[:, 35 * 256 :], expected[:, 35 * 256 :], atol=limit * loudest)
         assert loudest > 1e-3
 
 
