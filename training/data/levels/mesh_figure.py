@@ -182,8 +182,9 @@ def _draw_view(axes: Axes, examination: Examination) -> None:
         rays = np.stack([drawn.escape.starts, drawn.escape.ends], axis=1)[:100]
         axes.add_collection3d(Line3DCollection(rays, colors=_RAYS, linewidths=0.5, alpha=0.5))  # type: ignore[attr-defined]
     low, high = mesh.bounds_m
+    high = np.maximum(high, low + 1e-3)  # a flat level has a third axis too
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(np.maximum(high - low, 1e-3))
+    axes.set_box_aspect(high - low)
     axes.view_init(elev=38, azim=-60)  # type: ignore[attr-defined]
     axes.set_title("surfaces that face the viewer", fontsize=11, color=_TEXT)
     axes.tick_params(labelsize=8)

@@ -29,3 +29,9 @@ def test_the_legend_has_what_is_drawn_and_how_many(glb):
     assert "holes (4 edges)" in labels
     assert any(label.startswith("rays that left (") for label in labels)
     assert not any("slivers" in label or "doors" in label for label in labels)
+
+
+def test_a_flat_level_is_drawn_without_a_warning(glb):
+    sheet = Piece(np.array([(0, 0, 0), (4, 0, 0), (0, 0, 4)], float), np.array([(0, 2, 1)]), "wood")
+    seen = import_level(glb(WrittenNode("sheet", (sheet,))), Choices(is_open=True)).report.examination
+    assert len(figure_of(seen, "title", []).axes) == 2
