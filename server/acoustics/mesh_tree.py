@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Points
 from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_tree_kernel import Tree, build, find_closest, find_sight, find_walls
+from server.acoustics.mesh_tree_kernel import Tree, build, find_closest, find_distances, find_sight, find_walls
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int32]
@@ -103,6 +103,14 @@ class MeshTree:
         room = np.empty(MOST_CROSSED), np.empty(MOST_CROSSED, np.int32)
         find_walls(self.tree, starts, ends, SIGHT_MARGIN_M, SAME_PLACE_M, *room, walls, counts)
         return [walls[pair, :count] for pair, count in enumerate(counts)]
+
+    def distance_m(self, points: Points) -> _Floats:
+        """(...,) distance from each point to the nearest triangle."""
+        places = np.asarray(points, dtype=np.float64)
+        flat = np.ascontiguousarray(places.reshape(-1, 3))
+        distances = np.empty(len(flat))
+        find_distances(self.tree, flat, distances)
+        return distances.reshape(places.shape[:-1])
 
     def contains(self, points: Points) -> _Flags:
         """(...,) whether each point is in the air that the mesh encloses, or on its surfaces: whether in most

@@ -306,7 +306,7 @@ def closest_hit(
 
 
 @compiled_in_place
-def is_blocked(
+def first_blocker(
     tree: Tree,
     stack: Integers,
     x: float,
@@ -318,14 +318,19 @@ def is_blocked(
     least: float,
     most: float,
     without: int,
+    likely: int,
 ) -> int:
     """The row of a triangle that a ray meets between two distances, whichever is found first; -1 for none. Triangles of
-    the plane `without` are left out."""
+    the plane `without` are left out. The triangle of the row `likely` is tried before all others (-1 for none)."""
     if not abs(dx) + abs(dy) + abs(dz) > 0.0:
         return -1
     first, second, last, along, across, scale = _sheared(dx, dy, dz)
     axes, shear = (first, second, last), (along, across, scale)
     at = _pick(x, y, z, first), _pick(x, y, z, second), _pick(x, y, z, last)
+    if likely >= 0 and tree.planes[likely] != without:
+        distance, facing = _cross(tree.corners, likely, at, axes, shear)
+        if facing != 0.0 and least < distance < most:
+            return likely
     rx, ry, rz = _reciprocal(dx), _reciprocal(dy), _reciprocal(dz)
     stack[0] = 0
     waits = 1
@@ -434,7 +439,7 @@ def find_sight(tree: Tree, a: Floats, b: Floats, margin_m: float, in_sight: npt.
         in_sight[row] = True
         if length > 2 * margin_m:
             margin = margin_m / length
-            in_sight[row] = is_blocked(tree, stack, x, y, z, dx, dy, dz, margin, 1 - margin, -1) < 0
+            in_sight[row] = first_blocker(tree, stack, x, y, z, dx, dy, dz, margin, 1 - margin, -1, -1) < 0
 
 
 @compiled_in_place
@@ -501,3 +506,72 @@ def find_walls(
         counts[pair] = min(found, walls.shape[1])
         for wall in range(counts[pair]):
             walls[pair, wall] = tree.numbers[rows[wall]]
+
+
+@compiled
+def _box_square(bounds: Floats, node: int, x: float, y: float, z: float) -> float:
+    """The square of the distance from a point to a box."""
+    dx = max(bounds[node, 0] - x, 0.0, x - bounds[node, 3])
+    dy = max(bounds[node, 1] - y, 0.0, y - bounds[node, 4])
+    dz = max(bounds[node, 2] - z, 0.0, z - bounds[node, 5])
+    return float(dx * dx + dy * dy + dz * dz)
+
+
+@compiled
+def _segment_square(corners: Floats, row: int, first: int, second: int, x: float, y: float, z: float) -> float:
+    """The square of the distance from a point to an edge of a triangle."""
+    ax, ay, az = corners[row, first, 0], corners[row, first, 1], corners[row, first, 2]
+    ex, ey, ez = corners[row, second, 0] - ax, corners[row, second, 1] - ay, corners[row, second, 2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    square = ex * ex + ey * ey + ez * ez
+    share = min(1.0, max(0.0, (px * ex + py * ey + pz * ez) / square)) if square > 0.0 else 0.0
+    return float((px - share * ex) ** 2 + (py - share * ey) ** 2 + (pz - share * ez) ** 2)
+
+
+@compiled
+def _triangle_square(corners: Floats, row: int, x: float, y: float, z: float) -> float:
+    """The square of the distance from a point to a triangle: to its plane if the point is above the triangle, and to
+    the nearest edge otherwise."""
+    ax, ay, az = corners[row, 0, 0], corners[row, 0, 1], corners[row, 0, 2]
+    bx, by, bz = corners[row, 1, 0] - ax, corners[row, 1, 1] - ay, corners[row, 1, 2] - az
+    cx, cy, cz = corners[row, 2, 0] - ax, corners[row, 2, 1] - ay, corners[row, 2, 2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    square = nx * nx + ny * ny + nz * nz
+    if square > 0.0:
+        of_b = (py * cz - pz * cy) * nx + (pz * cx - px * cz) * ny + (px * cy - py * cx) * nz
+        of_c = (by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz
+        if of_b >= 0.0 and of_c >= 0.0 and of_b + of_c <= square:
+            return float((px * nx + py * ny + pz * nz) ** 2 / square)
+    return min(
+        _segment_square(corners, row, 0, 1, x, y, z),
+        _segment_square(corners, row, 1, 2, x, y, z),
+        _segment_square(corners, row, 2, 0, x, y, z),
+    )
+
+
+@compiled
+def find_distances(tree: Tree, points: Floats, distance_m: Floats) -> None:
+    """Fill the last array with the distances of points (n, 3) from the nearest triangle."""
+    stack = np.empty(STACK, np.int32)
+    for point in range(len(points)):
+        x, y, z = points[point, 0], points[point, 1], points[point, 2]
+        nearest = math.inf
+        stack[0] = 0
+        waits = 1
+        while waits > 0:
+            waits -= 1
+            node = stack[waits]
+            if _box_square(tree.bounds, node, x, y, z) >= nearest:
+                continue
+            count = tree.links[node, 1]
+            if count == 0:
+                near, far = node + 1, tree.links[node, 0]
+                if _box_square(tree.bounds, far, x, y, z) < _box_square(tree.bounds, near, x, y, z):
+                    near, far = far, near
+                stack[waits], stack[waits + 1] = far, near
+                waits += 2
+                continue
+            for row in range(tree.links[node, 0], tree.links[node, 0] + count):
+                nearest = min(nearest, _triangle_square(tree.corners, row, x, y, z))
+        distance_m[point] = math.sqrt(nearest)

@@ -3,7 +3,8 @@
 Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is stored on disk: in
 NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would reuse
 cached code as long as the file of the function is unchanged; here it is reused only as long as no module with compiled
-code has changed. A cache in a read-only folder, as in a container, is still read.
+code has changed, nor, of a function outside the server, any module beside it. A cache in a read-only folder, as in a
+container, is still read.
 """
 
 import contextlib
@@ -47,7 +48,13 @@ def compiled_in_place(function: Function) -> Function:
     return _compile(function, _nrt=False, forceinline=True)
 
 
-def _compile(function: Function, **more: bool) -> Function:
+def compiled_loosely(function: Function) -> Function:
+    """As `compiled`, for results that need not be the same to the last bit everywhere: sums may be taken in any order,
+    and products fused with them. What the function calls keeps to its own rules."""
+    return _compile(function, fastmath={"contract", "arcp", "reassoc", "nsz"})
+
+
+def _compile(function: Function, **more: Any) -> Function:
     if config.DISABLE_JIT:
         return function
     options = {"nopython": True, "nogil": True, "error_model": "numpy", **more}
@@ -103,6 +110,17 @@ def _digest_of_sources() -> str:
 
 
 @cache
+def _digest_beside(file: Path) -> str:
+    """A digest of the modules in the folder of one outside the server; empty for one of the server."""
+    if Path(__file__).parents[1] in file.parents:
+        return ""
+    digest = hashlib.sha256()
+    for beside in sorted(file.parent.glob("*.py")):
+        digest.update(beside.read_bytes())
+    return digest.hexdigest()
+
+
+@cache
 def _is_writable(folder: Path) -> bool:
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -115,6 +133,7 @@ def _is_writable(folder: Path) -> bool:
 class _Locator(_CacheLocator):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._line = function.__code__.co_firstlineno
+        self._file = Path(file)
         beside = Path(file).parent / "__pycache__"
         if "NUMBA_CACHE_DIR" in os.environ:
             self._folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "nafir" / beside.parent.name
@@ -127,7 +146,7 @@ class _Locator(_CacheLocator):  # type: ignore[misc]
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        return _digest_of_sources()
+        return _digest_of_sources() + _digest_beside(self._file)
 
     def get_disambiguator(self) -> str:
         return str(self._line)

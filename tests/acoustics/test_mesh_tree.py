@@ -254,3 +254,17 @@ def test_rays_that_are_not_finite_are_refused(bad):
         tree.closest((bad, 0, 0), (1, 0, 0))
     with pytest.raises(ValueError, match="directions: must be finite"):
         tree.closest((0, 0, 0), (1, bad, 0))
+
+
+def test_distance_is_that_of_the_nearest_point_of_any_triangle():
+    mesh, rng = soup(60, seed=5), np.random.default_rng(6)
+    points = rng.uniform(-7, 7, (80, 3))
+    found = MeshTree(mesh).distance_m(points)
+    steps = np.linspace(0, 1, 61)
+    u, v = np.meshgrid(steps, steps)
+    shares = np.stack([u, v, 1 - u - v], axis=-1)[u + v <= 1 + 1e-12]
+    spots = np.einsum("sk,tkx->tsx", shares, mesh.corners_m).reshape(-1, 3)
+    nearest = np.array([np.linalg.norm(spots - point, axis=-1).min() for point in points])
+    assert np.all(found <= nearest + 1e-12)
+    assert np.all(nearest - found < 0.06)
+    assert MeshTree(mesh).distance_m(mesh.corners_m).max() < 1e-12

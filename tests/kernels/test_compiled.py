@@ -205,3 +205,25 @@ def test_what_works_in_place_changes_what_it_is_given_and_cannot_allocate():
     assert one_of_copy(values) == 2
     with pytest.raises(NumbaError):
         one_of_copy_in_place(values)
+
+
+def test_outside_the_server_a_change_in_a_module_beside_is_heeded(package):
+    outside = package / "training"
+    outside.mkdir()
+    (outside / "inner.py").write_text("import numba\n\n\n@numba.njit\ndef twice(x):\n    return 2 * x\n")
+    (outside / "outer.py").write_text(
+        "from server.kernels.compiled import compiled_loosely\nfrom training.inner import twice\n\n"
+        "@compiled_loosely\ndef outer(x):\n    return twice(x) + 1\n"
+    )
+    check = "from training.outer import outer; print(outer(3), sum(outer.stats.cache_hits.values()))"
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package)
+
+    def told():
+        command = [sys.executable, "-c", check]
+        return subprocess.run(command, cwd=package, env=environment, check=True, capture_output=True, text=True).stdout
+
+    assert [told(), told()] == ["7 0\n", "7 1\n"]
+    inner = outside / "inner.py"
+    inner.write_text(inner.read_text().replace("2 * x", "5 * x"))
+    assert told() == "16 0\n"

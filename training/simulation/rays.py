@@ -28,14 +28,14 @@ from training.data.scene_file import HISTOGRAM_BIN_S
 
 _Floats = npt.NDArray[np.float64]
 
-_BANDS = len(OCTAVE_BANDS_HZ)
-_LARGEST_RADIUS_M = 0.4
+BANDS = len(OCTAVE_BANDS_HZ)
+LARGEST_RADIUS_M = 0.4
 # A crossing nearer than this to the start of a ray is the wall from which the ray comes.
 _OVERLAP = 1e-9
 # As energy falls, fewer rays are followed and each counts for more: their number falls with this power of the energy.
-_THINNING = 0.1
+THINNING = 0.1
 # Each reflection sends diffuse rain to a random sixth of the receivers: reflections are many, crossings of spheres few.
-_EVERY = 6
+EVERY = 6
 _TABLE = 64
 
 
@@ -61,7 +61,7 @@ def receiver_radii(plan: FloorPlan, receivers: _Floats) -> _Floats:
     them."""
     heights = receivers[:, 2]
     clearance = np.minimum(plan.wall_distance_m(receivers), np.minimum(heights, plan.height_m - heights))
-    return np.asarray(np.minimum(clearance, _LARGEST_RADIUS_M))
+    return np.asarray(np.minimum(clearance, LARGEST_RADIUS_M))
 
 
 class _Room(NamedTuple):
@@ -80,7 +80,7 @@ class _Room(NamedTuple):
 class _Receivers(NamedTuple):
     """The receivers. Positions (receiver, xyz) and radii of the spheres that count rays. The sign of `sides` (receiver,
     wall) says on which side of a wall's line a receiver is. `nearest` is the number of the nearest arrival direction,
-    by `_cell`."""
+    by `cell`."""
 
     positions: _Floats
     radii: _Floats
@@ -88,7 +88,7 @@ class _Receivers(NamedTuple):
     nearest: npt.NDArray[np.int32]
 
 
-class _Histogram(NamedTuple):
+class Histogram(NamedTuple):
     """Energies (receiver, bin, direction, band). A bin is the time in which sound travels `bin_m`."""
 
     energy: npt.NDArray[np.float32]
@@ -119,7 +119,7 @@ class RayTracer:
             positions,
             receiver_radii(plan, positions),
             edge_x * (positions[:, None, 1] - corners[:, 1]) - edge_y * (positions[:, None, 0] - corners[:, 0]),
-            _nearest_directions(arrival_directions),
+            nearest_directions(arrival_directions),
         )
         self._image_order = image_order
         self._directions = len(arrival_directions)
@@ -128,12 +128,12 @@ class RayTracer:
     @property
     def shape(self) -> tuple[int, int, int]:
         """The shape (direction, band, bin) of a receiver's energy."""
-        return self._directions, _BANDS, self._bins
+        return self._directions, BANDS, self._bins
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
         """(receiver, direction, band, bin) energies, without absorption by the air."""
         turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-        energy = np.zeros((len(self._receivers.positions), self._bins, self._directions, _BANDS), dtype=np.float32)
+        energy = np.zeros((len(self._receivers.positions), self._bins, self._directions, BANDS), dtype=np.float32)
         _trace(
             self._room,
             self._receivers,
@@ -141,12 +141,12 @@ class RayTracer:
             sphere_directions(rays) @ turn,
             self._image_order,
             rng,
-            _Histogram(energy, HISTOGRAM_BIN_S * SPEED_OF_SOUND),
+            Histogram(energy, HISTOGRAM_BIN_S * SPEED_OF_SOUND),
         )
         return np.ascontiguousarray(energy.transpose(0, 2, 3, 1))
 
 
-def _nearest_directions(directions: _Floats) -> npt.NDArray[np.int32]:
+def nearest_directions(directions: _Floats) -> npt.NDArray[np.int32]:
     """(row, column) index of the nearest of `directions`, on an octahedral map of the sphere to a square."""
     across = (np.arange(_TABLE) + 0.5) / _TABLE * 2 - 1
     u, v = np.meshgrid(across, across, indexing="ij")
@@ -158,12 +158,12 @@ def _nearest_directions(directions: _Floats) -> npt.NDArray[np.int32]:
     return np.asarray(np.argmax(points @ directions.T, axis=-1), dtype=np.int32)
 
 
-_FAST_MATH = {"contract", "arcp", "reassoc", "nsz"}
+FAST_MATH = {"contract", "arcp", "reassoc", "nsz"}
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _cell(x, y, z):
-    """The row and column in `_nearest_directions` for a direction of any length."""
+def cell(x, y, z):
+    """The row and column in `nearest_directions` for a direction of any length."""
     scale = 1 / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
     if z < 0:
@@ -172,13 +172,13 @@ def _cell(x, y, z):
     return min(int((u + 1) * half), _TABLE - 1), min(int((v + 1) * half), _TABLE - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH)
 def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
     """Add the energy of all rays to the histogram."""
     walls, rays = len(room.corners), len(directions)
     end_m = histogram.energy.shape[1] * histogram.bin_m
     offsets = np.empty((3, walls + 1))
-    kept, chance, weight = np.empty(_BANDS), np.empty(_BANDS), np.empty(_BANDS)
+    kept, chance, weight = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
     scale = 1.0 / rays
     for ray in range(rays):
         position = emitter[0], emitter[1], emitter[2]
@@ -195,7 +195,7 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
                 break  # the ray left the room through a corner by rounding
             # Scattered energy reaches receivers as diffuse rain, and image sources account for the first reflections.
             if is_mirrored and (was_scattered or reflections > image_order):
-                _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram)
+                add_crossings(receivers, position, direction, length, travelled_m, weight, histogram)
             px, py, pz = position
             dx, dy, dz = direction
             position = px + length * dx, py + length * dy, pz + length * dz
@@ -204,30 +204,30 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
                 break
             reflections += 1
             normal = _normal(room, surface, wall)
-            for band in range(_BANDS):
+            for band in range(BANDS):
                 weight[band] *= room.reflected[surface, band]
-            first = int(rng.random() * _EVERY)
+            first = int(rng.random() * EVERY)
             _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram)
-            is_scattered = rng.random() < room.scattered[surface, ray % _BANDS]
-            loudest = _weigh(room, surface, is_scattered, kept, chance, weight)
+            is_scattered = rng.random() < room.scattered[surface, ray % BANDS]
+            loudest = weigh(room, surface, is_scattered, kept, chance, weight)
             if loudest <= 0.0:
                 break
-            wanted = loudest**_THINNING
+            wanted = loudest**THINNING
             if wanted < share:
                 if rng.random() * share >= wanted:
                     break
                 share = wanted
-            for band in range(_BANDS):
+            for band in range(BANDS):
                 weight[band] *= scale / share
             is_mirrored = not is_scattered
             if is_scattered:
                 was_scattered = True
                 direction = _scattered_direction(surface, normal, rng.random(), rng.random())
             else:
-                direction = _mirrored_direction(direction, normal)
+                direction = mirrored_direction(direction, normal)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
 def _next_surface(room, position, direction, last):
     """The distance, surface and wall (-1 if none) that a ray meets next; the surface is -1 if it meets none. `last` is
     the wall from which the ray comes."""
@@ -252,7 +252,7 @@ def _next_surface(room, position, direction, last):
     return length, (surface, hit)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
 def _normal(room, surface, wall):
     """The unit vector from a surface into the room."""
     if surface == 0:
@@ -261,8 +261,8 @@ def _normal(room, surface, wall):
     return 0.0, 0.0, 1.0 if surface == 1 else -1.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
-def _add_crossings(receivers, position, direction, length, travelled_m, weight, histogram):
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+def add_crossings(receivers, position, direction, length, travelled_m, weight, histogram):
     """Add the energy of a ray to every receiver whose sphere it crosses within `length`."""
     px, py, pz = position
     dx, dy, dz = direction
@@ -281,15 +281,15 @@ def _add_crossings(receivers, position, direction, length, travelled_m, weight, 
                 chord = 2 * math.sqrt(radius * radius - beside)
                 # 4 pi r**2 at one metre, times the chord over the volume of the sphere.
                 gain = 3 * chord / (radius * radius * radius)
-                row, column = _cell(-dx, -dy, -dz)
+                row, column = cell(-dx, -dy, -dz)
                 target = histogram.energy[receiver, into_bin, receivers.nearest[row, column]]
-                for band in range(_BANDS):
+                for band in range(BANDS):
                     target[band] += gain * weight[band]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
 def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram):
-    """Add the scattered energy of a reflection to every `_EVERY`th receiver, from `first` on, if it is in sight."""
+    """Add the scattered energy of a reflection to every `EVERY`th receiver, from `first` on, if it is in sight."""
     walls = len(room.corners)
     surface, wall = hit
     px, py, pz = position
@@ -302,7 +302,7 @@ def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight
         offset_x[walls], offset_y[walls] = offset_x[0], offset_y[0]
         if wall >= 0:
             hit_side[wall] = 0.0
-    for receiver in range(first, len(receivers.positions), _EVERY):
+    for receiver in range(first, len(receivers.positions), EVERY):
         to_x, to_y, to_z = (
             receivers.positions[receiver, 0] - px,
             receivers.positions[receiver, 1] - py,
@@ -324,32 +324,32 @@ def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight
                 crossings += (before * after < 0.0) & (hit_side[other] * receivers.sides[receiver, other] < 0.0)
             if crossings > 0:
                 continue
-        gain = 4 * _EVERY * out / (distance * square)
-        row, column = _cell(-to_x, -to_y, -to_z)
+        gain = 4 * EVERY * out / (distance * square)
+        row, column = cell(-to_x, -to_y, -to_z)
         target = histogram.energy[receiver, into_bin, receivers.nearest[row, column]]
-        for band in range(_BANDS):
+        for band in range(BANDS):
             target[band] += gain * weight[band] * room.scattered[surface, band]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
-def _weigh(room, surface, is_scattered, kept, chance, weight):
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+def weigh(room, surface, is_scattered, kept, chance, weight):
     """Set the weight of each band after a reflection, and return the largest one. `kept` is the share of energy that
     all surfaces so far have reflected. `chance` is the probability of the path if the ray had been drawn for this band,
     up to a common factor."""
     total = 0.0
-    for band in range(_BANDS):
+    for band in range(BANDS):
         kept[band] *= room.reflected[surface, band]
         chance[band] *= room.scattered[surface, band] if is_scattered else 1.0 - room.scattered[surface, band]
         total += chance[band]
     loudest = 0.0
-    for band in range(_BANDS):
-        chance[band] *= _BANDS / total
+    for band in range(BANDS):
+        chance[band] *= BANDS / total
         weight[band] = kept[band] * chance[band]
         loudest = max(loudest, weight[band])
     return loudest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
 def _scattered_direction(surface, normal, share, turn):
     """A random direction by Lambert's law, from two uniform random numbers."""
     nx, ny, nz = normal
@@ -361,8 +361,8 @@ def _scattered_direction(surface, normal, share, turn):
     return a, b, out * nz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST_MATH, inline="always")
-def _mirrored_direction(direction, normal):
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+def mirrored_direction(direction, normal):
     dx, dy, dz = direction
     nx, ny, nz = normal
     into = dx * nx + dy * ny + dz * nz

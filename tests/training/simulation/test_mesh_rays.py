@@ -1,0 +1,229 @@
+"""Rays in meshes against the same rooms as floor plans, against formulas, and against what must not be heard."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from server.acoustics.decibels import power_to_db
+from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_tree import MeshTree
+from server.scene.geometry import Material
+from server.scene.mesh_geometry import MeshGeometry
+from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.simulation.mesh_rays import MeshRayTracer
+from training.simulation.rays import RayTracer, sphere_directions
+
+SCENES = Path(__file__).resolve().parents[3] / "training" / "scenes"
+QUADS = ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5))
+CUBE = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+INWARDS = np.array([(q[0], q[a], q[a + 1]) for q in QUADS for a in (1, 2)])
+MUTE, MIRROR, ROUGH = "mute", "mirror", "rough"
+
+
+def material(absorption, scattering):
+    return Material(absorption=(absorption,) * 7, scattering=(scattering,) * 7)
+
+
+def place_of(*parts, **materials):
+    """Parts are (vertices, triangles, name of a material)."""
+    names, vertices, triangles, surfaces = tuple(materials), [], [], []
+    for corners, faces, name in parts:
+        triangles.append(np.asarray(faces) + sum(map(len, vertices)))
+        vertices.append(np.asarray(corners, dtype=float))
+        surfaces.append(np.full(len(faces), names.index(name)))
+    mesh = TriangleMesh(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(surfaces), names)
+    return MeshGeometry(mesh, materials)
+
+
+def house(absorption, scattering):
+    """A room of 5 x 4 m under a gabled roof, 2.5 m high at the eaves and 4 m at the ridge, with a block in it."""
+    profile = np.array([(0, 0), (4, 0), (4, 2.5), (2, 4), (0, 2.5)], dtype=float)
+    ends = [np.column_stack([np.full(5, x), profile]) for x in (0.0, 5.0)]
+    gable = np.array([(0, 1, 2), (0, 2, 4), (2, 3, 4)])
+    here, after = np.arange(5), np.roll(np.arange(5), -1)
+    sides = [(a, b, b + 5) for a, b in zip(here, after, strict=True)]
+    sides += [(a, b + 5, a + 5) for a, b in zip(here, after, strict=True)]
+    shell = np.concatenate([gable, gable[:, ::-1] + 5, np.array(sides)[:, ::-1]])
+    block = CUBE * (1.5, 1.0, 0.8) + (2.5, 0.7, 0.9)
+    of_all = material(absorption, scattering)
+    return place_of((np.concatenate(ends), shell, ROUGH), (block, INWARDS[:, ::-1], ROUGH), **{ROUGH: of_all})
+
+
+EMITTER, RECEIVERS = np.array([1.0, 1.0, 1.2]), np.array([(4.4, 3.2, 1.4), (1.2, 3.0, 2.9), (4.0, 2.6, 2.4)])
+
+
+def traced(geometry, emitter, receivers, *, rays=3000, seed=0, image_order=0, duration_s=0.4, directions=12):
+    """(receiver, direction, band, bin)"""
+    tracer = MeshRayTracer(
+        geometry,
+        np.asarray(receivers, dtype=float),
+        duration_s=duration_s,
+        image_order=image_order,
+        arrival_directions=sphere_directions(directions),
+    )
+    return tracer.trace(emitter, rays=rays, rng=np.random.default_rng(seed))
+
+
+def decay_db(energy):
+    """Schroeder's backward integral over the last axis, from 0 dB."""
+    remaining = np.cumsum(energy[..., ::-1], axis=-1)[..., ::-1]
+    return power_to_db(np.maximum(remaining / remaining[..., :1], 1e-12))
+
+
+def decay_time_s(decay, upper_db, lower_db):
+    """(...,) time in which a decay falls by 60 dB, from its first bins below two levels."""
+    first, last = (np.argmax(decay < level, axis=-1) for level in (upper_db, lower_db))
+    fall = np.take_along_axis(decay, first[..., None], -1) - np.take_along_axis(decay, last[..., None], -1)
+    return 60 * (last - first) * HISTOGRAM_BIN_S / fall[..., 0]
+
+
+def parameters(energy):
+    """(parameter, receiver, band): level, C50, EDT and T60, in just-noticeable differences."""
+    energy = energy.sum(axis=1).astype(float)
+    decay, early = decay_db(energy), 13
+    clarity = power_to_db(energy[..., :early].sum(-1) / energy[..., early:].sum(-1))
+    times = (decay_time_s(decay, -0.5, -10), decay_time_s(decay, -5, -25))
+    return np.stack([power_to_db(energy.sum(-1)), clarity, *(20 * np.log(each) for each in times)])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "apartment",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("small1", "small2", "medium1", "medium2", "large1", "large2")
+        ),
+    ],
+)
+def test_a_plan_as_a_mesh_sounds_as_the_plan_within_the_repeatability_floor(name):
+    scene = SceneFile.read(SCENES / f"{name}.toml")
+    probes = scene.probe_positions(0)[::3]
+    settings = {
+        "duration_s": scene.simulation.duration_s,
+        "image_order": 1,
+        "arrival_directions": sphere_directions(12),
+    }
+    plan = RayTracer(scene.geometry, probes[1:], **settings)
+    mesh = MeshRayTracer(MeshGeometry.of_plan(scene.geometry), probes[1:], **settings)
+    one, other, as_mesh = (
+        parameters(tracer.trace(probes[0], rays=4000, rng=np.random.default_rng(seed)))
+        for tracer, seed in ((plan, 1), (plan, 2), (mesh, 3))
+    )
+    floor, difference = (np.abs(each - one).mean(axis=(1, 2)) for each in (other, as_mesh))
+    assert np.all(difference < 1.3 * floor)
+    # Their mean over the place hides the random part.
+    assert np.all(np.abs((as_mesh - one).mean(axis=(1, 2))) < 0.5)
+
+
+@pytest.mark.parametrize("scattering", [0.0, 0.5])
+def test_walls_that_absorb_nothing_keep_all_energy(scattering):
+    """What is radiated within a bin stays, and fills the room evenly: 4 pi c dt / V."""
+    place = house(0.0, scattering)
+    energy = traced(place, EMITTER, RECEIVERS, rays=20_000).sum(axis=1).mean(axis=0)
+    expected = 4 * np.pi * 343 * HISTOGRAM_BIN_S / place.mesh.volume_m3
+    assert place.mesh.volume_m3 == pytest.approx(5 * (4 * 2.5 + 4 * 1.5 / 2) - 1.5 * 1.0 * 0.8)
+    for half in (energy[:, 10:55], energy[:, 55:]):
+        np.testing.assert_allclose(power_to_db(half.mean(axis=-1) / expected), 0, atol=0.2)
+
+
+@pytest.mark.parametrize("absorption", [0.1, 0.2])
+def test_decay_is_eyrings_in_an_irregular_room(absorption):
+    place = house(absorption, 1.0)
+    surface_m2 = place.mesh.areas_m2.sum()
+    eyring_s = 24 * np.log(10) / 343 * place.mesh.volume_m3 / (-surface_m2 * np.log(1 - absorption))
+    energy = traced(place, EMITTER, RECEIVERS, duration_s=1.2)
+    found_s = decay_time_s(decay_db(energy.sum(axis=(0, 1, 2))), -5, -35)
+    # Paths differ in length (Kuttruff, Room Acoustics, sec. 5.3: gamma**2 of about 0.4).
+    path_spread = 1 + 0.4 / 2 * np.log(1 - absorption)
+    assert found_s == pytest.approx(eyring_s / path_spread, rel=0.05)
+
+
+def test_energy_is_the_same_the_other_way_round():
+    place = house(0.2, 0.5)
+    there = traced(place, EMITTER, RECEIVERS, rays=10_000)
+    for number, receiver in enumerate(RECEIVERS):
+        back = traced(place, receiver, EMITTER[None], rays=10_000)[0].sum(axis=(0, 2))
+        np.testing.assert_allclose(power_to_db(back / there[number].sum(axis=(0, 2))), 0, atol=0.3)
+
+
+def test_the_first_mirrored_reflection_of_a_slope_has_the_level_of_a_free_wave():
+    """All else is air: (1 - a) / d**2 with the distance from the image, which arrives from where the image is."""
+    slope = np.array([(-20, -20, 10), (20, -20, -10), (20, 20, -10), (-20, 20, 10)], dtype=float)
+    place = place_of((slope, [(0, 1, 2), (0, 2, 3)], MIRROR), **{MIRROR: material(0.36, 0.0)})
+    normal = place.mesh.normals[0]
+    emitter, receiver = np.array([0.3, 0.1, 2.0]), np.array([[2.0, 1.5, 1.0]])
+    image = emitter - 2 * (emitter @ normal) * normal
+    energy = traced(place, emitter, receiver, rays=100_000, directions=24)[0, :, 0]
+    distance = np.linalg.norm(image - receiver[0])
+    assert power_to_db(energy.sum() * distance**2 / 0.64) == pytest.approx(0, abs=0.2)
+    assert np.flatnonzero(energy.sum(axis=0)).tolist() == [int(distance / 343 / HISTOGRAM_BIN_S)]
+    heard = sphere_directions(24)[np.argmax(energy.sum(axis=1))]
+    assert heard @ (image - receiver[0]) / distance > 0.85
+
+
+def test_nothing_is_heard_through_closed_walls_however_the_room_is_turned():
+    """A booth around a receiver. Rays meet its edges and vertices at all angles, for seconds."""
+    rng = np.random.default_rng(3)
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    room, booth = (CUBE * (5, 4, 3)) @ turn, (CUBE + np.array((2, 1.5, 1))) @ turn
+    place = place_of((room, INWARDS, ROUGH), (booth, INWARDS[:, ::-1], ROUGH), **{ROUGH: material(0.01, 0.4)})
+    receivers = np.array([(2.5, 2.0, 1.5), (1.0, 1.0, 1.0)]) @ turn
+    energy = traced(place, np.array([1.0, 3.0, 2.0]) @ turn, receivers, rays=5000, duration_s=1.0)
+    assert energy[0].sum() == 0
+    assert energy[1].sum() > 0
+
+
+def test_both_sides_of_a_sheet_reflect():
+    """A box in two halves, divided by two triangles: each half keeps its energy for itself."""
+    sheet = [(2.0, 0, 0), (2.0, 3, 0), (2.0, 3, 2.5), (2.0, 0, 2.5)]
+    place = place_of(
+        (CUBE * (4, 3, 2.5), INWARDS, ROUGH), (sheet, [(0, 1, 2), (0, 2, 3)], ROUGH), **{ROUGH: material(0.0, 0.3)}
+    )
+    receivers = np.array([(0.8, 1.0, 1.2), (3.2, 1.0, 1.2)])
+    expected = 4 * np.pi * 343 * HISTOGRAM_BIN_S / (2 * 3 * 2.5)
+    for emitter, here, there in (((1.2, 2.0, 1.5), 0, 1), ((2.9, 2.2, 1.5), 1, 0)):
+        energy = traced(place, np.array(emitter), receivers, rays=20_000).sum(axis=1)
+        assert energy[there].sum() == 0
+        np.testing.assert_allclose(power_to_db(energy[here][:, 20:].mean(axis=-1) / expected), 0, atol=0.25)
+
+
+def test_bands_follow_the_materials_of_the_triangles_that_are_met():
+    loud, deaf = material(0.0, 0.0), Material(absorption=(0.0,) * 3 + (1.0,) * 4, scattering=(0.0,) * 7)
+    place = place_of(
+        (CUBE * (4, 3, 2.5), INWARDS[:10], MIRROR),
+        (CUBE * (4, 3, 2.5), INWARDS[10:], MUTE),
+        **{MIRROR: loud, MUTE: deaf},
+    )
+    energy = traced(place, np.array([1.0, 1, 1]), np.array([[3.0, 2, 1]]), duration_s=0.6).sum(axis=(0, 1))
+    late = energy[:, -40:].sum(axis=-1)
+    np.testing.assert_allclose(late[:3], late[0])
+    assert late[3:].max() < 0.1 * late[0]
+
+
+def test_triangles_that_are_known_to_be_in_sight_are_in_sight():
+    geometry = MeshGeometry.of_plan(SceneFile.read(SCENES / "large2.toml").geometry)
+    for place, receivers in (
+        (house(0.1, 0.1), RECEIVERS),
+        (geometry, SceneFile.read(SCENES / "large2.toml").probe_positions(0)),
+    ):
+        tracer = MeshRayTracer(
+            place, receivers, duration_s=0.1, image_order=0, arrival_directions=sphere_directions(12)
+        )
+        is_open, tree = tracer._receivers.is_open, MeshTree(place.mesh)
+        receiver, row = np.nonzero(is_open)
+        corners = tree.tree.corners[row]
+        shares = np.random.default_rng(0).dirichlet((1, 1, 1), (20, len(row)))
+        points = np.einsum("srk,rkx->srx", shares, corners)
+        assert tree.is_visible(receivers[receiver], points).all()
+        assert 0.02 < is_open.mean() < 0.98
+
+
+def test_a_material_may_be_changed_for_all_triangles_of_its_name():
+    place = house(0.5, 0.5)
+    quieter = replace(place, materials={ROUGH: material(0.9, 0.5)})
+    loud, quiet = (traced(each, EMITTER, RECEIVERS).sum() for each in (place, quieter))
+    assert power_to_db(quiet / loud) < -8
