@@ -57,7 +57,8 @@ def compiled_loosely(function: Function) -> Function:
 def _compile(function: Function, **more: Any) -> Function:
     if config.DISABLE_JIT:
         return function
-    options = {"nopython": True, "nogil": True, "error_model": "numpy", **more}
+    # What is not said here, numba would take over from whoever calls the function first.
+    options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": False, **more}
     return CompiledFunction(function, options, cache=lambda: _Cache(function), on_compiled=_Cache.count)
 
 

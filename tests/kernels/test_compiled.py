@@ -12,7 +12,7 @@ import pytest
 from numba.core.errors import NumbaError
 
 import server
-from server.kernels.compiled import compiled, compiled_in_place
+from server.kernels.compiled import compiled, compiled_in_place, compiled_loosely
 
 MODULES = {
     "server/__init__.py": "",
@@ -227,3 +227,22 @@ def test_outside_the_server_a_change_in_a_module_beside_is_heeded(package):
     inner = outside / "inner.py"
     inner.write_text(inner.read_text().replace("2 * x", "5 * x"))
     assert told() == "16 0\n"
+
+
+def test_what_a_loosely_compiled_function_calls_keeps_to_the_order_of_sums():
+    """Numba passes such a freedom on to what is called, and keeps that for all callers, unless it is told otherwise."""
+
+    @compiled
+    def lost(large, small):
+        return (large + small) - large
+
+    @compiled_loosely
+    def loose(large, small):
+        return lost(large, small) + ((large + small) - large)
+
+    @compiled
+    def strict(large, small):
+        return lost(large, small)
+
+    assert loose(1e16, 0.5) == 0.5
+    assert strict(1e16, 0.5) == 0.0

@@ -1,0 +1,119 @@
+"""Early reflections in a triangle mesh: sound that is reflected once, by a planar patch.
+
+A patch is a group of coplanar triangles that are joined by edges. It mirrors on both sides, with the material of the
+triangle that is met. Points and unit vectors are (..., xyz) in world coordinates, in metres. Bands are OCTAVE_BANDS_HZ.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_reflections_kernel import Patches, find_patch_reflections, join
+from server.acoustics.mesh_tree import MeshTree, planes_of
+from server.acoustics.mesh_tree_kernel import STACK
+from server.acoustics.reflections import Reflections
+
+_Floats = npt.NDArray[np.float64]
+_Integers = npt.NDArray[np.int32]
+
+MOST_REFLECTIONS = 64
+"""The most reflections of an emitter that are found. Larger patches are tried first."""
+# Vertices nearer to each other than this, on a grid of that size, are one.
+_SAME_VERTEX_M = 1e-6
+# A patch with less area than this mirrors nothing that is heard.
+_LEAST_M2 = 1e-4
+
+
+class MeshReflectionFinder:
+    """Finds the early reflections in one mesh. `gains_db` (material, band) are the specular gains of its materials, in
+    their order. Safe to share between threads."""
+
+    def __init__(self, tree: MeshTree, gains_db: npt.ArrayLike) -> None:
+        self._tree = tree.tree
+        self._gains_db = np.array(gains_db, dtype=np.float64)
+        self._surfaces = tree.mesh.surfaces
+        self._patches = _patches(tree)
+        # Compile here, so that the first pose need not wait for it.
+        self.find(np.zeros(3), np.zeros((1, 3)))
+
+    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:
+        """Find the reflections at `listener` (3,) from `emitters` (n, 3)."""
+        listener = np.ascontiguousarray(listener, dtype=np.float64)
+        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        room = len(emitters) * min(MOST_REFLECTIONS, len(self._patches.offsets))
+        emitter, triangle = np.empty(room, np.int64), np.empty(room, np.int32)
+        length_m, arrival, departure = np.empty(room), np.empty((room, 3)), np.empty((room, 3))
+        count = find_patch_reflections(
+            self._tree,
+            self._patches,
+            np.empty(STACK, np.int32),
+            listener,
+            emitters,
+            min(MOST_REFLECTIONS, len(self._patches.offsets)),
+            emitter,
+            triangle,
+            length_m,
+            arrival,
+            departure,
+        )
+        surfaces = self._surfaces[triangle[:count]]
+        return Reflections(
+            emitter[:count], length_m[:count], arrival[:count], departure[:count], self._gains_db[surfaces]
+        )
+
+
+@dataclass(frozen=True)
+class TransmissionLoss:
+    """What walls take from the sound that goes straight through them. `losses_db` (material, band) is what a wall of
+    each material takes."""
+
+    tree: MeshTree
+    losses_db: _Floats
+
+    def between(self, a: npt.ArrayLike, b: npt.ArrayLike) -> _Floats:
+        """(n, band) losses between pairs of points (n, 3), in dB; zero in sight. A wall counts once, with the material
+        by which it is entered from a."""
+        walls = self.tree.walls_between(np.asarray(a, np.float64), np.asarray(b, np.float64))
+        surfaces = self.tree.mesh.surfaces
+        return np.array([self.losses_db[surfaces[each]].sum(axis=0) for each in walls]).reshape(
+            len(walls), self.losses_db.shape[1]
+        )
+
+
+def patches_of(mesh: TriangleMesh) -> _Integers:
+    """(T,) the number of the patch to which each triangle belongs."""
+    places = np.rint(mesh.vertices_m / _SAME_VERTEX_M)
+    _, vertex = np.unique(places, axis=0, return_inverse=True)
+    corners = vertex.reshape(-1)[mesh.triangles]
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+    owners = np.repeat(np.arange(len(corners), dtype=np.int32), 3)
+    order = np.lexsort((sides[:, 1], sides[:, 0]))
+    labels = np.arange(len(corners), dtype=np.int32)
+    join(sides[order].astype(np.int64), owners[order], planes_of(mesh), labels)
+    _, patches = np.unique(labels, return_inverse=True)
+    return np.asarray(patches.reshape(-1), dtype=np.int32)
+
+
+def _patches(tree: MeshTree) -> Patches:
+    """The patches that are large enough, the largest first."""
+    mesh, of_triangle = tree.mesh, patches_of(tree.mesh)
+    areas = np.bincount(of_triangle, mesh.areas_m2)
+    kept = np.argsort(-areas, kind="stable")[: np.count_nonzero(areas >= _LEAST_M2)]
+    kept = kept if len(kept) else np.argsort(-areas, kind="stable")[:1]
+    low, high = np.full((len(areas), 3), np.inf), np.full((len(areas), 3), -np.inf)
+    np.minimum.at(low, of_triangle, mesh.corners_m.min(axis=1))
+    np.maximum.at(high, of_triangle, mesh.corners_m.max(axis=1))
+    # The largest triangle has the most exact normal.
+    widest = np.lexsort((-mesh.areas_m2, of_triangle))
+    widest = widest[np.searchsorted(of_triangle[widest], kept)]
+    normals = mesh.normals[widest]
+    numbers = np.full(len(areas), -1, np.int32)
+    numbers[kept] = np.arange(len(kept))
+    return Patches(
+        np.ascontiguousarray(normals.T),
+        np.sum(normals * mesh.corners_m[widest, 0], axis=-1),
+        np.ascontiguousarray(np.concatenate([low, high], axis=1)[kept].T),
+        numbers[of_triangle][tree.tree.numbers],
+    )
