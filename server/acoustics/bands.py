@@ -17,12 +17,19 @@ def in_filter_bands(air_db_per_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
     given = np.array(air_db_per_m, np.float64)
     if given.shape not in ((len(OCTAVE_BANDS_HZ),), (len(FILTER_BANDS_HZ),)):
         raise ValueError(f"air_db_per_m must have a value for each octave band, and has the shape {given.shape}")
-    return given if len(given) == len(FILTER_BANDS_HZ) else np.append(given, given[-1])
+    return given if len(given) == len(FILTER_BANDS_HZ) else in_octave_above(given)
+
+
+def in_octave_above(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(..., filter band) values given in OCTAVE_BANDS_HZ (..., band), with that of the last band again for the octave
+    above."""
+    given = np.asarray(values, np.float64)
+    return np.concatenate([given, given[..., -1:]], axis=-1)
 
 
 def bands_within(sample_rate: float) -> int:
-    """Number of OCTAVE_BANDS_HZ that begin below half the sample rate. Higher bands hold no sound."""
-    return sum(centre_hz / math.sqrt(2) < sample_rate / 2 for centre_hz in OCTAVE_BANDS_HZ)
+    """Number of FILTER_BANDS_HZ that begin below half the sample rate. Higher bands hold no sound."""
+    return sum(centre_hz / math.sqrt(2) < sample_rate / 2 for centre_hz in FILTER_BANDS_HZ)
 
 
 def band_positions(frequencies_hz: npt.ArrayLike) -> npt.NDArray[np.float64]:

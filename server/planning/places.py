@@ -57,7 +57,7 @@ def place_of(
         maximum=manifest.bounds.maximum,
         sample_rate=manifest.codec.sample_rate,
         speed_of_sound=manifest.speed_of_sound,
-        air_db_per_m=manifest.air.absorption_db_per_m,
+        air_db_per_m=manifest.air.filter_db_per_m,
         nearest_m=NEAR_LIMIT_M,
         plan=None if manifest.geometry is None else manifest.geometry.floor_plan,
         materials=manifest.geometry.materials if manifest.geometry is not None and manifest.image_order else None,

@@ -3,8 +3,8 @@ along the paths within reach, the first reflections, and the field's responses.
 
 Energies add up, except where first reflections meet the direct sound: there the interference is computed. Each effect
 defines its own factors on energies (`Factors`). The head is a sphere with outer ears. Axes are those of
-`server.planning.reach`, and v variants, each of which leaves out some effects. Energies are relative to the direct
-sound at one metre.
+`server.planning.reach`, and v variants, each of which leaves out some effects; bands are FILTER_BANDS_HZ. Energies are
+relative to the direct sound at one metre.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.audibility import JND_THRESHOLDS, ratio_in_jnd
-from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
+from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ, bands_within, in_filter_bands, in_octave_above
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import axes_of
 from server.acoustics.sound_path import SoundPaths
@@ -31,9 +31,9 @@ Off = frozenset[EffectName]
 ALL_ON: Off = frozenset()
 
 _SILENCE = 1e-12
-_FACING_GAIN = 4.0
-"""Gain of an ear that faces the sound, in power: 6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J. Acoust.
-Soc. Am. 56, 1974)."""
+_FACING_GAIN = np.array([4.0] * len(OCTAVE_BANDS_HZ) + [1.0])
+"""(band,) gain of an ear that faces the sound, in power: 6 dB; heads differ, and outer ears do more at 4 kHz (Shaw, J.
+Acoust. Soc. Am. 56, 1974). Above 10 kHz outer ears have notches and no gain on the whole."""
 _DIRECT_S = 0.0015
 _DECAY_POINTS = 48
 _THIRDS_HZ = 1000 * 2 ** (np.arange(-9, 11) / 3)
@@ -91,12 +91,12 @@ class Way:
     @cached_property
     def departure(self) -> Floats:
         """(n, band) factor of the emitter's directivity in the direction of departure."""
-        return db_to_power(self.departure_db)
+        return db_to_power(in_octave_above(self.departure_db))
 
     @cached_property
     def screen(self) -> Floats:
         """(n, band) factor of diffraction at the edges that they pass."""
-        return db_to_power(self.paths.screen_db)
+        return db_to_power(in_octave_above(self.paths.screen_db))
 
 
 _Of = TypeVar("_Of")
@@ -152,14 +152,14 @@ class Prediction:
         self.reverberation: list[Reverberation | None] = [
             each.reverberation or self.place.reverberation for each in self.emitters
         ]
-        self._held = np.zeros((len(self.emitters), len(OCTAVE_BANDS_HZ)))
+        self._held = np.zeros((len(self.emitters), len(FILTER_BANDS_HZ)))
         self._early, self._diffuse = np.zeros_like(self._held), np.ones_like(self._held)
         for number, (emitter, rest) in enumerate(zip(self.emitters, self.reverberation, strict=True)):
             if not emitter.is_omnidirectional:
                 self._diffuse[number] = np.mean(db_to_power(emitter.directivity.diffuse_gain_db))
             if rest is not None:
-                self._held[number], self._early[number] = rest.energy, rest.early
-        self._facing_gain = _FACING_GAIN if self.listener.output == "headphones" else 1.0
+                self._held[number], self._early[number] = in_octave_above(rest.energy), rest.early
+        self._facing_gain = _FACING_GAIN if self.listener.output == "headphones" else np.ones(len(FILTER_BANDS_HZ))
         self._decays = _Decays.of(self)
         self.whole = self.energies([ALL_ON])
         self._heard = self._parameters(self.whole)
@@ -167,7 +167,7 @@ class Prediction:
     def energies(self, variants: Sequence[Off]) -> Energies:
         """Return the energies in each of v variants, which are the sets of effects left out."""
         mirror = self.mirrored_energies(variants)
-        direct = np.zeros((len(variants), len(self.reach.owner), len(OCTAVE_BANDS_HZ)))
+        direct = np.zeros((len(variants), len(self.reach.owner), len(FILTER_BANDS_HZ)))
         mirrored = np.zeros((len(variants), *self._held.shape))
         held = np.zeros_like(mirrored)
         for variant, off in enumerate(variants):
@@ -272,7 +272,7 @@ class Prediction:
         after, other_after = (energy[:, owner] + _SILENCE for energy in (after, other_after))
         mirrored, chance = mirrored[:, owner], 2 * self._chance[owner]
 
-        def change(gain: float) -> Floats:
+        def change(gain: Floats | float) -> Floats:
             direct, other_direct = whole.direct * gain, left.direct * gain
             amplitude = np.abs(np.sqrt(direct) - np.sqrt(other_direct)) + mirrored_change
             by_chance = amplitude * held_root + held_change * np.sqrt(direct + mirrored)
@@ -285,8 +285,11 @@ class Prediction:
     @cached_property
     def _chance(self) -> Floats:
         """(e, band) greatest correlation of noise with other sound by chance, as two standard deviations."""
-        third_hz = np.asarray(OCTAVE_BANDS_HZ) * (2 ** (1 / 6) - 2 ** (-1 / 6))
-        decays_s = np.array([np.zeros(len(third_hz)) if rest is None else rest.t60_s for rest in self.reverberation])
+        third_hz = np.asarray(FILTER_BANDS_HZ) * (2 ** (1 / 6) - 2 ** (-1 / 6))
+        decays_s = np.zeros((len(self.emitters), len(third_hz)))
+        for number, rest in enumerate(self.reverberation):
+            if rest is not None:
+                decays_s[number] = in_octave_above(rest.t60_s)
         return np.asarray(2 / np.sqrt(np.maximum(third_hz * decays_s / 6.9, 4)))
 
     @cached_property
@@ -298,7 +301,7 @@ class Prediction:
         """(frequency,) octave bands of frequencies in thirds of octaves, and (m, frequency) phase factors of the delay
         of mirrored paths after the direct sound."""
         frequency = (_THIRDS_HZ[0.45 * self.place.sample_rate > _THIRDS_HZ, None] * _PER_THIRD).ravel()
-        bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(OCTAVE_BANDS_HZ))), axis=-1)
+        bands = np.argmin(np.abs(np.log2(frequency[:, None] / np.asarray(FILTER_BANDS_HZ))), axis=-1)
         paths, direct_m = self.mirrored, self.reach.paths.length_m
         later_s = (paths.length_m - direct_m[paths.owner]) / self.place.speed_of_sound
         return bands, np.exp(-2j * np.pi * later_s[:, None] * frequency)
@@ -315,7 +318,7 @@ class Prediction:
         return power_to_db(power.reshape(count, -1, len(_PER_THIRD)).mean(axis=-1))
 
     def _mirror(self) -> Mirrored:
-        bands = len(OCTAVE_BANDS_HZ)
+        bands = len(FILTER_BANDS_HZ)
         if self.place.reflections is None:
             none = np.zeros((0, bands))
             return Mirrored(np.zeros(0, np.int64), np.zeros(0), none, none, np.zeros((0, 3)))
@@ -325,10 +328,9 @@ class Prediction:
         for number, emitter in enumerate(self.emitters):
             if not emitter.is_omnidirectional:
                 mine = found.emitter == number
-                departure_db[mine] = emitter.directivity.gain_db(
-                    found.departure[mine] @ axes_of(emitter.pose.orientation).T
-                )
-        return Mirrored(found.emitter, found.length_m, found.gain_db, departure_db, found.arrival)
+                gain_db = emitter.directivity.gain_db(found.departure[mine] @ axes_of(emitter.pose.orientation).T)
+                departure_db[mine] = in_octave_above(gain_db)
+        return Mirrored(found.emitter, found.length_m, in_octave_above(found.gain_db), departure_db, found.arrival)
 
 
 def _spread(length_m: Floats, place: SceneAcoustics) -> Floats:
@@ -336,7 +338,7 @@ def _spread(length_m: Floats, place: SceneAcoustics) -> Floats:
 
 
 def _air(length_m: Floats, place: SceneAcoustics) -> Floats:
-    return db_to_power(-length_m[:, None] * place.air_db_per_m)
+    return db_to_power(-length_m[:, None] * in_filter_bands(place.air_db_per_m))
 
 
 def _known(
@@ -366,10 +368,10 @@ class _Decays:
 
     @classmethod
     def of(cls, prediction: "Prediction") -> "_Decays":
-        longest, paths = np.ones((len(prediction.emitters), len(OCTAVE_BANDS_HZ))), prediction.mirrored
+        longest, paths = np.ones((len(prediction.emitters), len(FILTER_BANDS_HZ))), prediction.mirrored
         for number, rest in enumerate(prediction.reverberation):
             if rest is not None:
-                longest[number] = rest.t60_s
+                longest[number] = in_octave_above(rest.t60_s)
         time_s = (longest @ prediction.shares)[:, None] * np.linspace(0, 1 / 6, _DECAY_POINTS)
         later_s = (paths.length_m - prediction.reach.paths.length_m[paths.owner]) / prediction.place.speed_of_sound
         return cls(

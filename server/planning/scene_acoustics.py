@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose, Vector3
 from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
@@ -138,9 +138,9 @@ class SceneAcoustics:
 
     @cached_property
     def band_shares(self) -> Bands:
-        """(band,) share of an impulse's energy in each band: the first band reaches down to 0 Hz, the last up to half
-        the sample rate."""
-        edges = np.asarray(OCTAVE_BANDS_HZ[1:]) / np.sqrt(2)
+        """(band,) share of an impulse's energy in each of FILTER_BANDS_HZ: the first band reaches down to 0 Hz, the
+        last up to half the sample rate."""
+        edges = np.asarray(FILTER_BANDS_HZ[1:]) / np.sqrt(2)
         return np.asarray(np.diff(np.clip([0.0, *edges, np.inf], 0, self.sample_rate / 2)) / (self.sample_rate / 2))
 
 

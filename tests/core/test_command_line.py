@@ -74,7 +74,7 @@ def test_every_command_is_strict(module):
 
 INPUTS = {
     *("bundle", "clip", "costs", "file", "hrtf", "path"),
-    *("as_long_as", "data", "points", "predictions", "teacher"),
+    *("as_long_as", "data", "materials", "points", "predictions", "teacher"),
 }
 OUTPUTS = {"output", "figure"}
 NEEDED = {"--listener": "1,1,1", "--emitter": "1,1,1", "--path": "absent.csv", "--output": "new.wav"}

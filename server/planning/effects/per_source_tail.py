@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 
+from server.acoustics.bands import in_octave_above
 from server.planning.change import MOST_JND, UNCHANGED, Change, in_jnd, most
 from server.planning.cost import STILL, Variant
 from server.planning.effect import RESPONSES, SharedEffect
@@ -26,7 +27,7 @@ def _change(prediction: Prediction) -> Change:
             return Change(MOST_JND, "t60")
     changes = [UNCHANGED]
     for own, shared in itertools.permutations(known, 2):
-        own_s, shared_s = (float(rest.t60_s @ shares) for rest in (own, shared))
+        own_s, shared_s = (float(in_octave_above(rest.t60_s) @ shares) for rest in (own, shared))
         # T60 is the slope from -5 to -35 dB, of which the late tail makes up a part or nothing.
         first_s, last_s = own_s * 5 / 60, own_s * 35 / 60
         tail = float(np.clip((last_s - start_s) / (last_s - first_s), 0, 1)) if own_s > 0 else 0.0
