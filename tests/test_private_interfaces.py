@@ -44,6 +44,7 @@ MODULES = {
     "numba.core.typing.templates": "server/kernels/by_reference.py",
     "numba.core.typing.typeof": "server/kernels/by_reference.py",
     "numba.np.linalg": "server/kernels/compiled.py",
+    "torch._dynamo": "training/learning/precision.py",
     "typer.core": "server/core/command_line.py",
     "uvicorn._types": "server/api/",
     "uvicorn.protocols.http.httptools_impl": "server/api/http_protocol.py",
@@ -69,6 +70,13 @@ def has_methods(kind: type, package: str, module: str, methods: dict[str, list[s
         method = getattr(kind, name, None)
         found = None if method is None else list(inspect.signature(method).parameters)[1:]
         relies(found == parameters, package, module, f"{kind.__name__}.{name} takes {parameters}, not {found}")
+
+
+def test_what_torch_cannot_compile_runs_as_it_was() -> None:
+    from torch._dynamo import config as compiling
+
+    holds = isinstance(compiling.suppress_errors, bool)
+    relies(holds, "torch", MODULES["torch._dynamo"], "torch._dynamo.config.suppress_errors is a switch")
 
 
 @pytest.mark.parametrize("package", sorted(PINNED))

@@ -1,6 +1,7 @@
 """Octave bands, in which materials, directivities and diffraction are described."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +28,9 @@ def in_octave_above(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.concatenate([given, given[..., -1:]], axis=-1)
 
 
-def bands_within(sample_rate: float) -> int:
-    """Number of FILTER_BANDS_HZ that begin below half the sample rate. Higher bands hold no sound."""
-    return sum(centre_hz / math.sqrt(2) < sample_rate / 2 for centre_hz in FILTER_BANDS_HZ)
+def bands_within(sample_rate: float, centres_hz: Sequence[float] = OCTAVE_BANDS_HZ) -> int:
+    """Number of octave bands that begin below half the sample rate. Higher bands hold no sound."""
+    return sum(centre_hz / math.sqrt(2) < sample_rate / 2 for centre_hz in centres_hz)
 
 
 def band_positions(frequencies_hz: npt.ArrayLike) -> npt.NDArray[np.float64]:

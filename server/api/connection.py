@@ -542,7 +542,7 @@ class Connection:
     def _require_seats(self, hello: Hello) -> None:
         """Raises RequestError too_many_listeners."""
         most = self._host.settings.max_listeners
-        # guard: a stream has room for so many listeners
+        # guard: a hello asks for no more listeners than there may be
         if (hello.listeners or 1) > most:
             raise RequestError("too_many_listeners", f"a stream has at most {most} listeners", field="listeners")
 

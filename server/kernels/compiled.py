@@ -54,6 +54,11 @@ def compiled_loosely(function: Function) -> Function:
     return _compile(function, fastmath={"contract", "arcp", "reassoc", "nsz"})
 
 
+def compiled_inline(function: Function) -> Function:
+    """As `compiled`, for small functions: compiled callers contain the code, by their own rules, in place of a call."""
+    return _compile(function, inline="always")
+
+
 def _compile(function: Function, **more: Any) -> Function:
     if config.DISABLE_JIT:
         return function
@@ -192,7 +197,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         # The version is compared before anything is unpickled: code from other sources may refer to modules that no
         # longer exist.
-        self._cache_file._version = f"{self._cache_file._version} {_digest_of_sources()}"
+        self._cache_file._version = f"{self._cache_file._version} {self._impl.locator.get_source_stamp()}"
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """As in numba, but without the rules of typing and lowering. Setting them up takes a third of a second, and

@@ -263,7 +263,7 @@ class Prediction:
         and more so the fewer modes it has. A decay has as many modes as its bandwidth times its duration.
         """
         owner, whole = self.reach.owner, self.whole
-        within = bands_within(self.place.sample_rate)
+        within = bands_within(self.place.sample_rate, FILTER_BANDS_HZ)
         mirrored, held = whole.mirrored, whole.held
         mirrored_change = np.abs(np.sqrt(mirrored) - np.sqrt(left.mirrored))[:, owner]
         held_root = np.sqrt(held)[:, owner]

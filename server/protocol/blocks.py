@@ -117,8 +117,8 @@ class AudioBlock:
             if getattr(self, name):
                 flags |= bit
         poses = self.pose_id, self.reverberation_pose_id
-        # guard: sequences wrap round
         whose = channels, self.listener
+        # guard: sequences wrap round
         return self.LAYOUT.pack(self.KIND, flags, *whose, self.sequence % 2**32, self.sample_clock, *poses, frames)
 
     @classmethod

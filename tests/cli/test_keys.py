@@ -49,7 +49,10 @@ def test_a_key_may_end_and_its_file_may_come_from_the_environment(nafir, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("create", "--scope", "everything"), "--scope: 'everything' is none of listen, render, upload, admin"),
+        (
+            ("create", "--scope", "everything"),
+            "--scope: 'everything' is none of listen, render, upload, metrics, admin",
+        ),
         (("create", "--scope", "listen", "--days", "0"), "--days"),
         (("create", "--scope", "listen", "--days", "nan"), "--days"),
         (("create", "--scope", "listen", "--name", "x" * 101), "--name"),

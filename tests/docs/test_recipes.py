@@ -26,7 +26,7 @@ def modules_with(*texts: str) -> set[str]:
 
 def test_every_message_for_a_game_is_one() -> None:
     messages = [parse_client_message(text) for text in blocks("how-to/play-from-a-game.md", "json")]
-    types = ["hello", *2 * ["add_emitter"], "acknowledge", "listener", "hello", "resume", "resume"]
+    types = ["hello", *2 * ["add_emitter"], "acknowledge", "listener", "add_listener", "hello", "resume", "resume"]
     assert [message.type for message in messages] == types
 
 

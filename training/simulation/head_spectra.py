@@ -8,12 +8,12 @@ sine per bin, computed eight bins at a time.
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, band_weights
 from server.acoustics.minimum_phase import folded_cepstrum
+from server.kernels.compiled import compiled
 from server.kernels.simd import (
     LANES,
     broadcast,
@@ -93,7 +93,7 @@ class HeadSpectra:
         return parts
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _spectra(corners, shares, turns, path_logs, logs, numbers, spectra):
     """Fill `spectra` (wave, yaw, ear and bin). `turns` (direction, ear) are radians per bin; a direction is a wave at a
     yaw."""
@@ -124,7 +124,7 @@ def _spectra(corners, shares, turns, path_logs, logs, numbers, spectra):
                     spectra[wave, yaw, ear * bins + number] = complex(parts[0, number], parts[1, number])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _triangles_around(across, inverses, directions):
     """(direction,) the triangle that contains each direction, and (direction, 3) the weights of its corners."""
     triangles, shares = np.empty(len(directions), np.int64), np.empty((len(directions), 3))

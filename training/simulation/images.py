@@ -6,11 +6,11 @@ in height (Borish, "Extension of the image model to arbitrary polyhedra", JASA 7
 Berkley, JASA 65(4), 1979, in one). Metres.
 """
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
+from server.kernels.compiled import compiled
 
 _Floats = npt.NDArray[np.float64]
 _Counts = npt.NDArray[np.int64]
@@ -50,7 +50,7 @@ def images_in_plan(
     return paths[0][once], paths[1][once], paths[2][once]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_blocked(corners, ax, ay, bx, by, first, second):
     """Whether a wall stands between a and b. The walls `first` and `second`, on which a and b lie, are left out (-1 for
     none)."""
@@ -70,7 +70,7 @@ def _is_blocked(corners, ax, ay, bx, by, first, second):
     return False
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_seen(corners, walls, images, depth, receiver):
     """Whether the path of the image in `walls[:depth]` reaches the receiver. `images[k]` is the emitter mirrored in the
     first k walls."""
@@ -95,7 +95,7 @@ def _is_seen(corners, walls, images, depth, receiver):
     return not _is_blocked(corners, x, y, images[0, 0], images[0, 1], last, -1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _see(corners, emitter, receivers, order):
     count = len(corners)
     walls = np.full(order + 1, -1)

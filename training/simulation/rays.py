@@ -16,12 +16,12 @@ wavelength spectral sampling", 2014). No band is biased, and no weight exceeds t
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
+from server.kernels.compiled import compiled_inline, compiled_loosely
 from server.scene.geometry import Geometry
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S
@@ -158,10 +158,7 @@ def nearest_directions(directions: _Floats) -> npt.NDArray[np.int32]:
     return np.asarray(np.argmax(points @ directions.T, axis=-1), dtype=np.int32)
 
 
-FAST_MATH = {"contract", "arcp", "reassoc", "nsz"}
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled_inline
 def cell(x, y, z):
     """The row and column in `nearest_directions` for a direction of any length."""
     scale = 1 / (abs(x) + abs(y) + abs(z))
@@ -172,7 +169,7 @@ def cell(x, y, z):
     return min(int((u + 1) * half), _TABLE - 1), min(int((v + 1) * half), _TABLE - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH)
+@compiled_loosely
 def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
     """Add the energy of all rays to the histogram."""
     walls, rays = len(room.corners), len(directions)
@@ -227,7 +224,7 @@ def _trace(room, receivers, emitter, directions, image_order, rng, histogram):
                 direction = mirrored_direction(direction, normal)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def _next_surface(room, position, direction, last):
     """The distance, surface and wall (-1 if none) that a ray meets next; the surface is -1 if it meets none. `last` is
     the wall from which the ray comes."""
@@ -252,7 +249,7 @@ def _next_surface(room, position, direction, last):
     return length, (surface, hit)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def _normal(room, surface, wall):
     """The unit vector from a surface into the room."""
     if surface == 0:
@@ -261,7 +258,7 @@ def _normal(room, surface, wall):
     return 0.0, 0.0, 1.0 if surface == 1 else -1.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def add_crossings(receivers, position, direction, length, travelled_m, weight, histogram):
     """Add the energy of a ray to every receiver whose sphere it crosses within `length`."""
     px, py, pz = position
@@ -287,7 +284,7 @@ def add_crossings(receivers, position, direction, length, travelled_m, weight, h
                     target[band] += gain * weight[band]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight, offsets, histogram):
     """Add the scattered energy of a reflection to every `EVERY`th receiver, from `first` on, if it is in sight."""
     walls = len(room.corners)
@@ -331,7 +328,7 @@ def _add_rain(room, receivers, first, hit, position, normal, travelled_m, weight
             target[band] += gain * weight[band] * room.scattered[surface, band]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def weigh(room, surface, is_scattered, kept, chance, weight):
     """Set the weight of each band after a reflection, and return the largest one. `kept` is the share of energy that
     all surfaces so far have reflected. `chance` is the probability of the path if the ray had been drawn for this band,
@@ -349,7 +346,7 @@ def weigh(room, surface, is_scattered, kept, chance, weight):
     return loudest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def _scattered_direction(surface, normal, share, turn):
     """A random direction by Lambert's law, from two uniform random numbers."""
     nx, ny, nz = normal
@@ -361,7 +358,7 @@ def _scattered_direction(surface, normal, share, turn):
     return a, b, out * nz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH, inline="always")
+@compiled_inline
 def mirrored_direction(direction, normal):
     dx, dy, dz = direction
     nx, ny, nz = normal

@@ -14,7 +14,6 @@ Axes: responses (yaw, ear, sample) in single precision; spectra have bins last.
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
@@ -22,6 +21,7 @@ from scipy.sparse import coo_array
 
 from server.acoustics.bands import band_weights
 from server.acoustics.geometry import axes_of
+from server.kernels.compiled import compiled
 from server.rendering.hrtf import HeadFilters
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND
@@ -233,7 +233,7 @@ class BinauralSynthesis:
         _add_at(start - lead, taps, response.reshape(-1, self.samples))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add_at(starts, taps, response):
     """Add the `taps` (wave, channel, tap) to the response (channel, sample) from each wave's start on, and cut them at
     both ends of the response."""

@@ -7,10 +7,10 @@ result says so. Lengths are in metres.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from server.kernels.compiled import compiled
 from training.data.levels.vectors import dot
 
 _Floats = npt.NDArray[np.float64]
@@ -81,7 +81,7 @@ def lies_on_others(places: _Floats, own: _Integers, corners: _Floats, cells: Cel
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fill(low, high, origin, size, shape):
     counts = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
     held = np.empty(0, np.int32)
@@ -105,7 +105,7 @@ def _fill(low, high, origin, size, shape):
     return counts, held
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _meet(corners, low, high, normals, triangles, origin, size, shape, starts, held, most):
     """Pairs (n, 2), their kinds (1 crossing, 2 lying on each other), and whether all were tried."""
     pairs = [(np.int64(0), np.int64(0))]
@@ -139,7 +139,7 @@ def _meet(corners, low, high, normals, triangles, origin, size, shape, starts, h
     return np.array(pairs)[1:], np.array(kinds)[1:], True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _kind(one, two, normal_one, normal_two, vertices_one, vertices_two):
     shared = 0
     for i in range(3):
@@ -162,7 +162,7 @@ def _kind(one, two, normal_one, normal_two, vertices_one, vertices_two):
     return 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pierces(p, q, corner, normal):
     """Whether the line from p to q goes through the inside of a triangle, by more than a touch on either side."""
     before, behind = dot(p - corner[0], normal), dot(q - corner[0], normal)
@@ -177,7 +177,7 @@ def _pierces(p, q, corner, normal):
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _overlap(one, two, normal):
     """Whether two triangles of one plane overlap by more than a touch: no side of either parts them."""
     for which in range(2):
@@ -201,7 +201,7 @@ def _overlap(one, two, normal):
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _covered(places, own, corners, origin, size, shape, starts, held):
     found = np.zeros(len(places), np.bool_)
     for n in range(len(places)):
@@ -216,7 +216,7 @@ def _covered(places, own, corners, origin, size, shape, starts, held):
     return found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _distance(p, corner):
     """The distance from a point to a triangle: to its plane if the point stands over it, else to its nearest side."""
     normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])

@@ -9,10 +9,10 @@ replaced: the bound is proved for each, not measured.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from server.kernels.compiled import compiled
 from training.data.levels.vectors import dot
 
 _Floats = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def _around(vertices: int, triangles: _Integers) -> tuple[_Integers, _Integers]:
     return starts, order // 3
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _remove(vertices, triangles, materials, error, starts, around, within, fixed):
     """Remove what vertices can be removed at once, none of them neighbours of each other; triangles that go get the
     vertices -1. Returns the number of vertices removed. Vertices that could not go are set in `fixed`, and are tried
@@ -131,7 +131,7 @@ def _remove(vertices, triangles, materials, error, starts, around, within, fixed
     return removed
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_touched(touched, starts, around, v):
     found = False
     for i in range(starts[v], starts[v + 1]):
@@ -139,7 +139,7 @@ def _is_touched(touched, starts, around, v):
     return found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _order(triangles, starts, around, v, ring, own):
     """Put the sides that face `v` one behind the other. Returns whether they form a closed ring, and whether they form
     one ring or path at all."""
@@ -175,20 +175,20 @@ def _order(triangles, starts, around, v, ring, own):
     return ring[count - 1, 1] == ring[0, 0], True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _swap(ring, own, i, j):
     a, b, t = ring[i, 0], ring[i, 1], own[i]
     ring[i, 0], ring[i, 1], own[i] = ring[j, 0], ring[j, 1], own[j]
     ring[j, 0], ring[j, 1], own[j] = a, b, t
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _normal(a, b, c):
     cross = np.cross(b - a, c - a)
     return cross / max(np.sqrt(dot(cross, cross)), 1e-300)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _groups(materials, own, normals, group, count, is_closed):
     """Number the groups of one material and plane in `group`. Returns where the second and the third begin, and how
     many there are: 1, 2 in a closed ring, or 0 for more."""
@@ -209,12 +209,12 @@ def _groups(materials, own, normals, group, count, is_closed):
     return breaks[0], breaks[1], 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _vertex(ring, index, count):
     return ring[index, 0] if index < count else ring[count - 1, 1]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _spread(vertices, ring, normals, group, count, groups, v):
     """How far apart the corners of a group are across its mean plane, of the group where that is most."""
     most = 0.0
@@ -237,7 +237,7 @@ def _spread(vertices, ring, normals, group, count, groups, v):
     return most
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _off_line(v, u, w):
     """The distance of v from the line between u and w; infinite if it does not lie between them."""
     along = w - u
@@ -249,7 +249,7 @@ def _off_line(v, u, w):
     return np.sqrt(dot(apart, apart))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _shape(vertices, a, b, c):
     """Height over longest side of a triangle."""
     p, q, r = vertices[b] - vertices[a], vertices[c] - vertices[b], vertices[a] - vertices[c]
@@ -258,7 +258,7 @@ def _shape(vertices, a, b, c):
     return np.sqrt(dot(cross, cross)) / square if square > 0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _filling(vertices, triangles, starts, around, ring, normals, count, is_closed, u):
     """The worst shape of the triangles that fill the hole of `v` from `u`; 0 if one of them faces elsewhere than that
     whose side it takes over, or if `u` and the vertex that goes are joined

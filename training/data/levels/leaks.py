@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from server.kernels.compiled import compiled
 from training.data.levels.contacts import cells_of
 from training.data.levels.vectors import dot
 
@@ -72,7 +72,7 @@ def _turn(rng: np.random.Generator) -> _Floats:
     return np.asarray(turn * np.sign(np.diag(upper)))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _march(starts, along, corners, origin, size, shape, cell_starts, held):
     """(n,) whether each ray meets nothing, and (n,) how far it goes within the cells. Steps from cell to cell
     (Amanatides & Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics 1987)."""
@@ -106,7 +106,7 @@ def _march(starts, along, corners, origin, size, shape, cell_starts, held):
     return missed, reach
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _meets(start, along, corner):
     """Whether a ray meets a triangle, from either side (Möller & Trumbore, 1997)."""
     one, two = corner[1] - corner[0], corner[2] - corner[0]

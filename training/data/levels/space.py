@@ -7,9 +7,10 @@ A gap narrower than the grid's step may join two regions or not. Lengths are in 
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from server.kernels.compiled import compiled
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
@@ -85,7 +86,7 @@ def sample_space(corners: _Floats) -> Space:
     return Space(origin, step, region, points, seen)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _lines(corner, origin, step, first, second, shape):
     """The range of the grid's lines along an axis that a triangle's shadow may meet: first, last, first, last."""
     low_a = min(corner[0, first], corner[1, first], corner[2, first])
@@ -100,7 +101,7 @@ def _lines(corner, origin, step, first, second, shape):
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _crossing(corner, a, b, along, first, second):
     """Where the line at (a, b) along an axis crosses a triangle, and twice the area of its shadow, signed; NaN if it
     misses. A line along the common edge of two triangles crosses both."""
@@ -118,7 +119,7 @@ def _crossing(corner, a, b, along, first, second):
     return u * corner[0, along] + v * corner[1, along] + w * corner[2, along], area
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _block(corners, origin, step, along, blocked):
     """Set the flags of links, between each point and the next along an axis, that a triangle crosses."""
     first, second = (along + 1) % 3, (along + 2) % 3
@@ -137,7 +138,7 @@ def _block(corners, origin, step, along, blocked):
                     blocked[index[0], index[1], index[2]] = True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _count_seen(corners, origin, step, region, along, seen):
     """Add to `seen` (region, 2) the crossings that show each region a front and a back."""
     first, second = (along + 1) % 3, (along + 2) % 3
@@ -163,7 +164,7 @@ def _count_seen(corners, origin, step, region, along, seen):
                 seen[below, 1 if area > 0 else 0] += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _count_sides(corners, origin, step, region, along, is_air, found):
     first, second = (along + 1) % 3, (along + 2) % 3
     shape = region.shape
@@ -190,7 +191,7 @@ def _count_sides(corners, origin, step, region, along, is_air, found):
                     found[t, 0 if above == (area > 0) else 1] += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _flood(links, region):
     """Number the regions in `region` (x, y, z), which is -1 throughout, and return the number of points of each."""
     nx, ny, nz = region.shape
