@@ -50,11 +50,11 @@ class Patient:
         self.work.clear()
 
 
-def open_stream(hello, field, filters, load_clip, *, lead, deliver, window=40):
+def open_stream(hello, field, filters, load_clip, *, lead, deliver, window=40, **options):
     """At the top of its ladder, which has the scene's only level."""
     levels, offer = FieldsByLevel([field]), Offer((field.level,), {field.level.name: 1.0})
     ladder = Ladder(offer.steps(hello.level, block_s=BLOCK_S))
-    session = Session(hello, levels, filters, load_clip, quality=ladder.step, window=window)
+    session = Session(hello, levels, filters, load_clip, quality=ladder.step, window=window, **options)
     return Stream(session, levels, offer=offer, ladder=ladder, block_s=BLOCK_S, lead=lead, deliver=deliver)
 
 
@@ -66,12 +66,19 @@ class Stage:
         self.engine = AudioEngine(lambda call: call(), self.workers, time_s=self.clock)
         (self.thread,) = self.engine.threads
 
-    def open(self, *, lead=4, window=1_000):
+    def open(self, *, lead=4, window=1_000, **options):
         clip = np.ones(64, np.float32)
         hello = Hello(protocol=PROTOCOL, scene="flat")
         delivered = []
         stream = open_stream(
-            hello, self.field, self.filters, lambda _: clip, window=window, lead=lead, deliver=delivered.extend
+            hello,
+            self.field,
+            self.filters,
+            lambda _: clip,
+            window=window,
+            lead=lead,
+            deliver=delivered.extend,
+            **options,
         )
         self.engine.open(stream)
         return stream, delivered

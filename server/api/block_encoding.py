@@ -6,7 +6,7 @@ delay everybody's blocks, and on an audio thread everybody's rendering.
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from server.protocol.packets import BlockEncoder
@@ -47,7 +47,9 @@ class BlockEncoding:
         """How many blocks and messages may wait."""
         self._post = post
         self._deliver = deliver
-        self._blocks = 0
+        self._heard_blocks = 0.0
+        """How long the sound was that has passed, in blocks, whoever of the listeners had it."""
+        self._heard_until: int | None = None
         self._cpu_s = 0.0
         self._waiting: list[Outgoing] = []
         self._is_encoding = False
@@ -55,7 +57,7 @@ class BlockEncoding:
     @property
     def load(self) -> float:
         """Share of a core that encoding the blocks of all listeners has taken so far; 0 before the first block."""
-        return self._cpu_s / (self._blocks * self._block_s) if self._blocks else 0.0
+        return self._cpu_s / (self._heard_blocks * self._block_s) if self._heard_blocks else 0.0
 
     def put(self, outgoing: list[Outgoing]) -> bool:
         if len(self._waiting) + len(outgoing) > self.capacity:
@@ -83,12 +85,22 @@ class BlockEncoding:
         except Exception:
             _logger.exception("a stream could not be encoded")
             outgoing = [StreamFailed()]
-        self._blocks += sum(isinstance(each, TimedBlock) and each.block.listener == 0 for each in outgoing)
+        self._note_heard(outgoing)
         self._cpu_s += time.thread_time() - began_s
         try:
             self._post(lambda: self._finish(outgoing))
         except RuntimeError:  # the loop is closed
             _logger.debug("the server ended while a stream was encoded")
+
+    def _note_heard(self, outgoing: Sequence[Outgoing]) -> None:
+        """Count the sound that passes with these blocks: by the clock, since any listener's window may be full."""
+        for each in outgoing:
+            if isinstance(each, TimedBlock):
+                size = each.block.samples.shape[-1]
+                end = each.block.sample_clock + size
+                since = end - size if self._heard_until is None else self._heard_until
+                self._heard_blocks += max(0, end - since) / size
+                self._heard_until = max(since, end)
 
     def _encoder_of(self, listener: int) -> BlockEncoder:
         if listener not in self._encoders:

@@ -38,7 +38,7 @@ from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
 from server.api.block_encoding import CHANNEL_SHARE, BlockEncoding
 from server.api.catalogue import describe_scene
-from server.api.inflow import Allowance
+from server.api.inflow import LISTENER_COST, Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
 from server.api.process_peers import ProcessPeers
@@ -135,6 +135,8 @@ _STATE_S = 1.0
 """Limit for the state of a stream to come from its audio thread, which is woken for it."""
 _SNAPSHOT_PERIOD_S = 3.0
 """Time between two snapshots of a stream: what its client would have to send again if the server was lost."""
+_MOST_DEPARTED_WORK = 4
+"""Responses and plans for listeners who have left that may still be computed while another listener comes."""
 _UNCOUNTED: Final = ListenerPose | MoveEmitter | DryBlock | DryPackets | Acknowledge | Ping
 """Messages that do not count as handled (`Snapshot.handled`): they have numbers of their own, or need not be sent
 again."""
@@ -956,11 +958,17 @@ class Connection:
         levels = stream.levels
         number = self._roster.enter(message.id)
         try:
+            # guard: who comes and goes in a loop leaves no work behind without bound
+            if stream.audience.departed_work >= _MOST_DEPARTED_WORK:
+                problem = "the server still computes for listeners who have left: ask again in 1 s"
+                raise RequestError("server_busy", problem, status=503, retry_after_s=1)
             if (refusal := host.admission.add_listener(place)) is not None:
                 raise refusal.error
             try:
                 if message.hrtf is not None:
                     await asyncio.to_thread(host.head, message.hrtf, levels)
+                if self._fast_path is not None:
+                    self._fast_path.charge(LISTENER_COST)
                 make = partial(self._new_listener, message, number, hello, levels, stream.ladder.step)
                 new = await host.openings.run(make, is_wanted=self._is_there)
                 if new is None:

@@ -27,6 +27,8 @@ READ_COST: Final = 1 / 4
 """Cost of each read from the socket, however few bytes it brings."""
 OTHER_FRAME_COST: Final = 2.0
 """Cost of a frame that is not a whole message (a ping, a fragment), which uvicorn's slower path handles."""
+LISTENER_COST: Final = 400.0
+"""Cost of another listener's session, which takes about 8 ms to make."""
 _LIVE_COST: Final = 1 / 2
 _OPUS_FRAMES: Final = 240
 """Samples in Opus that are decoded, and as many filled in, in the time of a unit."""

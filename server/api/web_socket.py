@@ -64,6 +64,10 @@ def _no_allowance(_: Allowance) -> None:
     """The default of `FastPath.allow`, for servers without budgets."""
 
 
+def _no_charge(_: float) -> None:
+    """The same of `FastPath.charge`."""
+
+
 @dataclass(frozen=True)
 class FastPath:
     """Direct access to a WebSocket connection that bypasses ASGI. Messages stay in order with those sent through
@@ -76,6 +80,8 @@ class FastPath:
     that a newer one follows directly."""
     allow: Callable[[Allowance], None] = _no_allowance
     """Sets the rate at which the client's budget fills."""
+    charge: Callable[[float], None] = _no_charge
+    """Takes so many units (`server.api.inflow`) from the client's budget, for what a message has made the server do."""
     is_open: Callable[[], bool] = lambda: True
     """Whether the connection is still open, as far as is known."""
 
@@ -205,7 +211,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         super().handle_connect(event)
         if not self.handshake_complete:  # it is complete if the request was refused
             self.scope["extensions"][_EXTENSION] = {
-                "path": FastPath(self._write, self._listen, self._allow, self._is_open)
+                "path": FastPath(self._write, self._listen, self._allow, self._spend, self._is_open)
             }
 
     def on_task_complete(self, task: asyncio.Task[None]) -> None:
@@ -271,6 +277,9 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
         if self.read_paused:  # until the application has received what waits
             return
         self._spend(0.0)
+        if self._budget is not None and self._budget.wait_s:  # it was charged meanwhile
+            self._go_on_later()
+            return
         self._take_slice()
         if self._next_slice is None and not self.read_paused and not self.transport.is_closing():
             self.transport.resume_reading()

@@ -50,10 +50,12 @@ class Workers:
         return bool(self._unfinished)
 
     def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
-        """Queue `work(*args)`; the future has its result. Takes no lock that a worker holds, since a worker of low
-        priority may hold a lock for long."""
+        """Queue `work(*args)`; the future has its result. If that is cancelled, the work is dropped at once. Takes no
+        lock that a worker holds, since a worker of low priority may hold a lock for long."""
         future: Future[T] = Future()
-        run = partial(_settle, future, work, args)
+        asked = [(work, args)]
+        future.add_done_callback(lambda _: asked.clear())  # what was called off keeps nothing alive while it waits
+        run = partial(_settle, future, asked)
         self._unfinished.append(None)
         (self._urgent if is_urgent else self._usual[kind]).append(run)
         self.pool.submit(self._run_next)
@@ -80,9 +82,11 @@ class Workers:
         return chosen
 
 
-def _settle(future: Future[T], work: Callable[..., T], args: tuple[Any, ...]) -> None:
+def _settle(future: Future[T], asked: list[tuple[Callable[..., T], tuple[Any, ...]]]) -> None:
+    """`asked` is the work with its arguments, and empty once the future is done."""
     if not future.set_running_or_notify_cancel():
         return
+    ((work, args),) = asked
     try:
         result = work(*args)
     except BaseException as exc:  # noqa: BLE001  raised where the result is read

@@ -50,6 +50,7 @@ from server.protocol.server_messages import (
 from server.protocol.snapshot import KeptListener, Snapshot
 from server.rendering.renderer import Renderer
 from server.responses.ir_request import IrRequest, IrResponse
+from server.streaming.pending_work import PendingWork
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from server.streaming.stream_times import ResponseWait, StreamTimes
@@ -84,6 +85,8 @@ class Member:
     has_asked: bool = False
     is_answered: bool = False
     """Whether the answer to its request waits in the inbox. Workers set it."""
+    pending: PendingWork = field(default_factory=PendingWork)
+    """Its responses and plans that workers have not finished."""
 
     @property
     def id(self) -> str | None:
@@ -133,6 +136,8 @@ class Audience:
         self._holds: dict[str, _Hold] = {}
         self._fading_in: list[tuple[Member, str]] = []
         """Emitters that begin later for a listener than for others, who have the gain in effect."""
+        self._departed: tuple[PendingWork, ...] = ()
+        """Work for listeners who have left that was being done then."""
 
     @property
     def members(self) -> tuple[Member, ...]:
@@ -144,6 +149,11 @@ class Audience:
         books = self._books
         counts = sum((member.count() for member in books.members), Counter(books.left))
         return counts, [books.left_times, *(member.times for member in books.members)]
+
+    @property
+    def departed_work(self) -> int:
+        """How many pieces of work for listeners who have left are still being done. Any thread may call this."""
+        return sum(map(len, self._departed))
 
     @property
     def runs_by_itself(self) -> bool:
@@ -256,6 +266,8 @@ class Audience:
         return ListenerAdded(id=new.message.id, index=session.index, hrtf=new.hrtf, sample_clock=clock)
 
     def _remove(self, member: Member) -> list[ServerMessage]:
+        member.pending.cancel()
+        self._departed = tuple(pending for pending in (*self._departed, member.pending) if pending)
         books = self._books
         times = StreamTimes()
         times.merge(books.left_times)

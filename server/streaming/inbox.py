@@ -4,11 +4,8 @@ The event loop and the workers put items in, and the audio thread takes them out
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeVar
 
 from server.planning.plan import Plan
 from server.protocol.client_messages import MOST_LISTENERS, AddEmitter, ClientMessage, ListenerPose, RemoveListener
@@ -18,7 +15,6 @@ from server.streaming.plan_audit import Regret
 from server.streaming.quality_steps import QualityStep
 
 MAX_WAITING_MESSAGES = 256
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -109,26 +105,3 @@ class Inbox:
         """Take the messages that wait now, each with its time of arrival."""
         for _ in range(len(self._messages)):
             yield self._messages.popleft()
-
-
-class PendingWork:
-    """Work of one stream that workers have not finished yet."""
-
-    def __init__(self) -> None:
-        # Finished futures are removed, since a future refers to its callback and so to the stream.
-        self._futures: set[Future[Any]] = set()
-
-    def keep_outcome(self, future: "Future[T]", keep: "Callable[[T | BaseException], None]") -> None:
-        """Call `keep` with the result or the exception: on the worker's thread, or at once if it is done."""
-        self._futures.add(future)
-        future.add_done_callback(partial(self._settle, keep))
-
-    def cancel(self) -> None:
-        for future in tuple(self._futures):
-            future.cancel()
-
-    def _settle(self, keep: "Callable[[T | BaseException], None]", future: "Future[T]") -> None:
-        self._futures.discard(future)
-        if not future.cancelled():
-            failure = future.exception()
-            keep(future.result() if failure is None else failure)

@@ -26,9 +26,10 @@ from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
 from server.streaming.audience import Audience, Member, NewListener
-from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, PendingWork, StreamMessage, TakeSnapshot
+from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, StreamMessage, TakeSnapshot
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
+from server.streaming.pending_work import PendingWork
 from server.streaming.plan_audit import FIRST_S, PERIOD_S, Regret, RegretRecord, interval_s
 from server.streaming.quality_steps import Offer, QualityStep
 from server.streaming.request_queue import RequestQueue
@@ -147,7 +148,7 @@ class Stream:
         self._request_cpu_s = 0.0
         """CPU time of the requests that were answered in this period."""
         self._inbox = Inbox()
-        self._pending = PendingWork()
+        self._checking = PendingWork()
         self._pause = Pause()
         self._levels = levels
         self._offer = offer
@@ -311,7 +312,7 @@ class Stream:
         for member in self.audience.members:
             if (wanted := member.session.take_plan_request()) is not None:
                 plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
-                self._pending.keep_outcome(plan, partial(self._keep_plan, member))
+                member.pending.keep_outcome(plan, partial(self._keep_plan, member))
             self._ask(workers, member)
 
     def _ask(self, workers: Workers, member: Member) -> None:
@@ -326,12 +327,14 @@ class Stream:
             answer = workers.submit(
                 _compute_timed, self._levels, request, session, kind="response", is_urgent=request.is_first
             )
-            self._pending.keep_outcome(answer, partial(self._keep_answer, member, request))
+            member.pending.keep_outcome(answer, partial(self._keep_answer, member, request))
         member.wait.note(member.has_asked or member.wants_turn, self._time_s())
 
     def leave(self) -> None:
         """Cancel all work requested by this stream."""
-        self._pending.cancel()
+        self._checking.cancel()
+        for member in self.audience.members:
+            member.pending.cancel()
 
     @property
     def request_s(self) -> float:
@@ -470,7 +473,7 @@ class Stream:
         if (check := member.session.take_check()) is not None:
             self._next_check_s = None
             regret = workers.submit(check.run, self._levels[check.level], kind="plan")
-            self._pending.keep_outcome(regret, partial(self._keep_regret, member))
+            self._checking.keep_outcome(regret, partial(self._keep_regret, member))
 
     def _keep_regret(self, member: Member, regret: Regret | BaseException) -> None:
         self._inbox.regrets.append((member, regret))  # processed with the next block

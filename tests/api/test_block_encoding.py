@@ -74,6 +74,22 @@ def test_it_says_what_it_takes(jobs):
     assert 0 < encoded.load < 1
 
 
+def test_it_takes_as_much_of_the_time_that_passes_whoever_has_the_blocks(jobs):
+    """Not all listeners have every block: the window of one who acknowledges nothing is full."""
+    loads = []
+    for listeners in ([0], [1], [0, 1], [1, 0]):
+        encoded = encoding(jobs, [])
+        for number in range(40):
+            sent = [timed(number) for _ in listeners]
+            for listener, each in zip(listeners, sent, strict=True):
+                each.block.listener = listener
+            encoded.put(sent if number < 10 else sent[:1])
+            jobs.work()
+        passed_s = 40 * SIZE / 24_000
+        loads.append(encoded.load * passed_s / encoded._cpu_s)
+    assert loads == pytest.approx([1.0] * 4)
+
+
 def test_a_stream_that_cannot_be_encoded_has_failed(jobs, monkeypatch, caplog):
     heard = []
     encoded = encoding(jobs, heard)

@@ -10,18 +10,20 @@ from starlette.websockets import WebSocketDisconnect
 
 from server.api.catalogue import open_clips
 from server.api.connection import Connection, StreamHost
+from server.api.inflow import LISTENER_COST
 from server.api.response_cache import ResponseCache
 from server.api.settings import Settings
 from server.api.web_socket import FastPath
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.places import place_of_field
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, Ping, RemoveEmitter
-from server.protocol.server_messages import Error, Status, parse_server_message
+from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, AddListener, Hello, Ping, RemoveEmitter
+from server.protocol.server_messages import Error, ListenerAdded, Status, parse_server_message
 from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
 from server.runtime.workers import Workers
+from server.streaming.audience import Audience
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.quality_steps import Offer
 from server.streaming.session import Session
@@ -208,6 +210,36 @@ def test_a_client_that_reads_too_late_learns_why_it_was_cut_off(field, hrtfs):
     socket = asyncio.run(scenario())
     assert socket.close_code == 1008
     assert socket.sent[-1].code == "reads_too_slowly"
+
+
+def told(socket, kind):
+    return [message for message in socket.sent if isinstance(message, kind)]
+
+
+def test_a_listener_costs_its_client_and_waits_for_work_of_those_who_left(field, hrtfs, monkeypatch):
+    charged = []
+
+    async def scenario():
+        socket = Socket()
+        way = FastPath(write=lambda _: False, listen=lambda _: None, charge=charged.append)
+        async with hosting(field, hrtfs) as host:
+            running = asyncio.create_task(Connection(socket, host, fast_path=way).run())
+            socket.say(HELLO)
+            with monkeypatch.context() as patched:
+                patched.setattr(Audience, "departed_work", 4)
+                socket.say(AddListener(id="guest", position=(1.0, 2.0, 1.0)))
+                await until(lambda: told(socket, Error))
+            assert charged == []
+            assert next(iter(host.admission._places)).listeners == 1
+            socket.say(AddListener(id="guest", position=(1.0, 2.0, 1.0)))
+            await until(lambda: told(socket, ListenerAdded))
+            await socket.close(1000, "")
+            await running
+        return told(socket, Error)
+
+    (refusal,) = asyncio.run(scenario())
+    assert (refusal.code, refusal.listener, refusal.retry_after_s) == ("server_busy", "guest", 1)
+    assert charged == [LISTENER_COST]
 
 
 def test_before_the_server_is_warm_a_client_is_told_to_come_back(field, hrtfs):

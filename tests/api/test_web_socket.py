@@ -474,6 +474,40 @@ def test_who_has_spent_its_budget_is_read_no_more_for_a_while_and_loses_nothing(
     assert 0.8 < lasted_s < 3.0
 
 
+def test_who_was_charged_for_a_dear_message_is_read_no_more_for_a_while():
+    heard, is_open, has_heard = [], asyncio.Event(), asyncio.Event()
+
+    async def listen(scope, _receive, send):
+        way = fast_path(scope)
+        way.allow(Allowance(messages_per_s=400, bytes_per_s=1e6))
+
+        def hear(message):
+            heard.append((time.monotonic(), message))
+            if message == "0":
+                way.charge(300.0)  # of the 100 that a full budget holds
+                has_heard.set()
+            return True
+
+        way.listen(hear)
+        is_open.set()
+        while len(heard) < 5:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await send({"type": "websocket.close"})
+
+    async def talk():
+        async with serving(listen) as address, connect(address, compression=None) as client:
+            await is_open.wait()
+            await client.send("0")
+            await has_heard.wait()
+            for number in range(1, 5):
+                await client.send(str(number))
+            await asyncio.wait_for(client.wait_closed(), 10)
+
+    asyncio.run(talk())
+    assert [message for _, message in heard] == list(map(str, range(5)))
+    assert 0.4 < heard[1][0] - heard[0][0] < 3.0
+
+
 def test_of_pings_that_come_together_the_newest_is_answered():
     """With what the standard has for it, and the connection goes on."""
     pongs, is_open = [], asyncio.Event()

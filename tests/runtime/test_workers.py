@@ -9,6 +9,7 @@ import weakref
 import pytest
 
 from server.runtime.workers import Workers
+from server.streaming.pending_work import PendingWork
 
 
 @pytest.fixture
@@ -70,6 +71,21 @@ def test_what_was_cancelled_is_left_out(workers, hold):
     hold()
     kept.result(timeout=10)
     assert done == [2]
+
+
+def test_what_was_cancelled_is_let_go_of_while_it_waits(workers, hold):
+    class Asker:
+        def keep(self, outcome):
+            raise AssertionError(outcome)
+
+    asker, pending = Asker(), PendingWork()
+    reference = weakref.ref(asker)
+    pending.keep_outcome(workers.submit(print, asker, kind="response", is_urgent=True), asker.keep)
+    pending.cancel()
+    assert len(pending) == 0
+    del asker
+    assert reference() is None
+    hold()
 
 
 def test_several_workers_do_everything_once():

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
+from server.planning.places import place_of_field
 from server.protocol.blocks import DryBlock
 from server.protocol.client_messages import (
     PROTOCOL,
@@ -29,6 +30,7 @@ from server.streaming.audience import Audience, NewListener, Roster
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from server.streaming.stream_times import StreamTimes
+from tests.engine_stage import BLOCK_S, Stage
 
 CLIP = (0.05 * np.random.default_rng(8).standard_normal(2_000)).astype(np.float32)
 FULL = QualityStep("standard", None, Sharing.NOTHING, 1.0)
@@ -333,6 +335,42 @@ def test_a_snapshot_has_all_listeners_and_restores_them(room, field, filters):
         limit = 2e-3 if identifier == "guest" else 1e-5
         assert_allclose(again.of(identifier)[:, 35 * 256 :], expected[:, 35 * 256 :], atol=limit * loudest)
         assert loudest > 1e-3
+
+
+@pytest.mark.parametrize("has_plans", [False, True])
+def test_who_comes_and_goes_in_a_loop_leaves_no_work_behind(field, filters, has_plans):
+    """While the workers have time for nothing."""
+    stage, place = Stage(field, filters), place_of_field(field) if has_plans else None
+    stream, _ = stage.open(place=place)
+    stream.offer(talker())
+    stage.run(3 * BLOCK_S)
+
+    def come_and_go(number):
+        message = AddListener(id="guest", position=EAST)
+        options = {"window": 1_000, "place": place, "listener": message.pose, "index": number}
+        session = Session(HELLO, stream.levels, filters, lambda _: CLIP, quality=stream.ladder.step, **options)
+        stream.offer(NewListener(message, session, "kemar"))
+        stage.run(2 * BLOCK_S)
+        yield stream.audience.members[1]
+        stream.offer(RemoveListener(id="guest"))
+        stage.run(2 * BLOCK_S)
+
+    for number in range(1, 51):
+        assert all(len(member.pending) for member in come_and_go(number))
+    assert len(stage.workers.urgent) == 51
+    assert sum(not future.done() for future, *_ in stage.workers.work) == 1
+    assert stream.audience.departed_work == 0
+    begun = []
+    for number in range(51, 54):
+        for _ in come_and_go(number):
+            begun.append(stage.workers.work[-1])
+            begun[-1][0].set_running_or_notify_cancel()
+    assert stream.audience.departed_work == 3
+    for future, function, arguments in begun:
+        future.set_result(function(*arguments))
+    assert stream.audience.departed_work == 0
+    stage.run(2 * BLOCK_S)
+    assert [member.id for member in stream.audience.members] == [None]
 
 
 def test_a_roster_gives_a_number_again_only_after_all_others():

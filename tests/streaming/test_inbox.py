@@ -5,7 +5,8 @@ from concurrent.futures import Future
 import pytest
 
 from server.protocol.client_messages import AddEmitter, ListenerPose, MoveEmitter
-from server.streaming.inbox import MAX_WAITING_MESSAGES, Inbox, PendingWork
+from server.streaming.inbox import MAX_WAITING_MESSAGES, Inbox
+from server.streaming.pending_work import PendingWork
 
 HERE = (2.0, 2.0, 1.5)
 
