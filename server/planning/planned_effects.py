@@ -111,6 +111,11 @@ class PlannedEffects:
         self.output = output or self.output
         self._is_stale = True
 
+    def wish_as(self, other: "PlannedEffects") -> None:
+        """Have the overrides by the listener, and the output, that `other` has by now."""
+        self._own, self.output = dict(other._own), other.output
+        self._is_stale = True
+
     def hear_by_bus(self, order: int | None) -> None:
         """Plan from now on for a quality level with a bus of this order, or for one without."""
         self._is_stale |= order != self._bus

@@ -378,14 +378,16 @@ class Audience:
         self._fading_in = still
 
     def follow_clock(self) -> list[ServerMessage]:
-        """Note what has come to its end by the next block: an emitter's clip ends when all listeners have heard it."""
+        """Note what has come to its end by the next block: an emitter's clip ends when all listeners have heard it for
+        whom it has begun. One whose response fails keeps no sound alive."""
         if len(self.members) == 1:
             return self.first.session.follow_clock()
         told: list[ServerMessage] = []
         for member in self.members:
             member.session.follow_ramps()
         for name in tuple(self.first.session.emitters):
-            if all(member.session.has_ended(name) for member in self.members):
+            still = [member.session for member in self.members if not member.session.has_ended(name)]
+            if len(still) < len(self.members) and not any(session.renderer.has_begun(name) for session in still):
                 for member in self.members:
                     told += self.collect(member, member.session.end_emitter(name))
         return told

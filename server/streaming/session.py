@@ -427,11 +427,14 @@ class Session:
         return errors
 
     def join(self, other: "Session", quality: QualityStep, sequence: int) -> None:
-        """Begin where the session of another listener of the stream is: at its clock and quality, with its emitters,
-        which fade in where they are by now. The first block has this `sequence`."""
+        """Begin where the session of another listener of the stream is: at its clock and quality, with what the client
+        wishes by now, and with its emitters, which fade in where they are. The first block has this `sequence`."""
         self._responses.continue_from(other.newest_pose_id)
         self._followed_pose_id = other.newest_pose_id
         self.continue_at(other.sample_clock, sequence)
+        self._output = other._output
+        if self._effects.planned is not None and other._effects.planned is not None:
+            self._effects.planned.wish_as(other._effects.planned)
         for emitter in other.emitters.values():
             self._restore_emitter(emitter.kept(), emitter)
         self.set_quality(quality, "chosen")

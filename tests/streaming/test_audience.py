@@ -18,6 +18,7 @@ from server.protocol.client_messages import (
     MoveEmitter,
     RemoveEmitter,
     RemoveListener,
+    SetEffects,
     SetGain,
     StopEmitter,
 )
@@ -39,23 +40,23 @@ HELLO = Hello(protocol=PROTOCOL, scene="flat", listener={"position": WEST})
 
 
 class Room:
-    """An audience in the flat whose responses are computed at once, and what each listener has heard."""
+    """An audience in the flat whose responses are computed at once, and what each listener has heard. With a `place`
+    their effects are planned."""
 
-    def __init__(self, field, filters):
-        self.levels, self.filters = FieldsByLevel([field]), filters
+    def __init__(self, field, filters, *, place=None):
+        self.levels, self.filters, self.place = FieldsByLevel([field]), filters, place
         self.audience = Audience(self.session(), StreamTimes())
         self.roster = Roster(8)
         self.heard = {None: []}
         self.told = []
 
     def session(self, hello=HELLO, **options):
-        return Session(
-            hello, self.levels, self.filters, lambda _: CLIP, quality=FULL, window=10**6, max_emitters=4, **options
-        )
+        options |= {"quality": FULL, "window": 10**6, "max_emitters": 4, "place": self.place}
+        return Session(hello, self.levels, self.filters, lambda _: CLIP, **options)
 
-    def join(self, identifier, position=EAST):
+    def join(self, identifier, position=EAST, hello=HELLO):
         message = AddListener(id=identifier, position=position)
-        session = self.session(listener=message.pose, index=self.roster.enter(identifier))
+        session = self.session(hello, listener=message.pose, index=self.roster.enter(identifier))
         self.told.append(self.audience.join(NewListener(message, session, "kemar"), FULL))
         self.heard.setdefault(identifier, [])
         return session
@@ -69,6 +70,8 @@ class Room:
         for member in self.audience.members:
             if whose and member.id not in whose:
                 continue
+            if (wanted := member.session.take_plan_request()) is not None:
+                self.told += self.audience.adopt(member, wanted.plan())
             if (request := member.session.take_request()) is not None:
                 response = compute_irs(self.levels, request, member.session.renderer)
                 self.told += self.audience.accept(member, response)
@@ -220,6 +223,29 @@ def test_one_who_comes_during_a_ramp_hears_the_gain_of_the_others(room, field, f
     assert np.abs(expected[:, 30 * 256 : 40 * 256]).max() > 1e-3
 
 
+def test_one_who_comes_later_hears_with_the_effects_that_are_wished_by_then(field, filters):
+    place, hello = place_of_field(field), HELLO.model_copy(update={"effects": {"air_absorption": False}})
+    wishes = {"late_reverberation": False, "hrtf": False, "air_absorption": None}
+    rooms = {}
+    for comes_at in (0, 12):
+        room = rooms[comes_at] = Room(field, filters, place=place)
+        room.audience = Audience(room.session(hello), StreamTimes())
+        room.send(talker())
+        for number in range(70):
+            if number == comes_at:
+                room.join("guest", hello=hello)
+            if number == 6:
+                assert room.send(SetEffects(effects=wishes, output="mono")) == []
+            room.play(1)
+        (guest,) = (member.session for member in room.audience.members[1:])
+        kept = guest.snapshot(session="5e", handled=0).hello
+        assert (kept.effects, kept.output) == ({"late_reverberation": False, "hrtf": False}, "mono")
+    early, late = rooms[0].of("guest")[:, 12 * 256 :], rooms[12].of("guest")
+    after = 40 * 256
+    assert np.abs(early[:, after:]).max() > 1e-3
+    assert_allclose(late[:, after:], early[:, after:], atol=1e-3 * np.abs(early).max())
+
+
 def test_one_who_leaves_leaves_the_others_untouched(room, field, filters):
     room.join("guest")
     room.join("third", (2.0, 4.0, 1.5))
@@ -271,6 +297,22 @@ def test_one_whose_response_fails_keeps_nobody_waiting(room, is_removed):
         room.play(20)
         assert room.of("guest")[:, -256:].any()
     assert sum(isinstance(each, EmitterAdded) for each in [*room.told, *told]) == (2 if is_removed else 1)
+
+
+@pytest.mark.parametrize("fails_for", [None, "guest"])
+def test_a_short_sound_ends_though_one_never_hears_it(room, fails_for):
+    room.join("guest")
+    for number in range(6):  # more than there is room for at once
+        assert room.send(talker(str(number), loop=False, remove_when_ended=True)) == []
+        room.answer("guest" if fails_for is None else None)
+        failing = next(member for member in room.audience.members if member.id == fails_for)
+        room.told += room.audience.give_up(failing, failing.session.take_request())
+        room.play(100, answers=False)
+        assert not any(member.session.emitters for member in room.audience.members)
+    ended = [(each.id, each.removed) for each in room.told if isinstance(each, EmitterEnded)]
+    assert ended == [(str(number), True) for number in range(6)]
+    assert not room.of(fails_for).any()
+    assert room.of("guest" if fails_for is None else None).any()
 
 
 def test_an_emitter_that_has_no_room_for_one_is_there_for_none(room, monkeypatch):
