@@ -24,7 +24,7 @@ import re
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -56,7 +56,7 @@ from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
-from server.planning.scene_acoustics import SceneAcoustics
+from server.planning.scene_acoustics import Reverberation, SceneAcoustics
 from server.protocol.blocks import DryBlock, DryPackets
 from server.protocol.client_messages import (
     AUTO,
@@ -96,6 +96,7 @@ from server.protocol.packets import BlockEncoder, LiveDecoders
 from server.protocol.server_messages import (
     EmitterEnded,
     Error,
+    ListenerRemoved,
     Pong,
     Resumed,
     ResumedListener,
@@ -103,7 +104,7 @@ from server.protocol.server_messages import (
     SnapshotTaken,
     Welcome,
 )
-from server.protocol.snapshot import MOST_BYTES, Seal, Snapshot
+from server.protocol.snapshot import MOST_BYTES, KeptListener, Seal, Snapshot
 from server.rendering.hrtf import HeadFilters
 from server.rendering.ingest import DryAudio
 from server.runtime.logs import about
@@ -222,6 +223,17 @@ class MeasuredScene:
     place: SceneAcoustics
     offer: Offer
     render_costs: Mapping[str, RenderCost]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the sessions of a stream need of its scene besides the levels, as it was offered when the stream was opened:
+    another may be offered under the same id before a listener or an emitter comes."""
+
+    clips: ClipLibrary
+    """At the stream's sample rate."""
+    reverberations: tuple[Reverberation, ...]
+    effect_costs: Mapping[int | None, Costs]
 
 
 @dataclass(frozen=True)
@@ -348,6 +360,13 @@ class StreamHost:
         self.render_costs[name, rate] = scene.render_costs
         self.scenes[name] = levels
 
+    def offered(self, scene: str, levels: FieldsByLevel) -> _Scene:
+        """What is offered now of a scene besides its levels, at their sample rate."""
+        rate = levels.default.sample_rate
+        # What effects cost is measured at the scene's own rate, and no plan says what is true of another.
+        costs = self.effect_costs.get(scene, {}) if rate == levels.own_rate else {}
+        return _Scene(self.clips[scene].at_rate(rate), self.places[scene].reverberations, costs)
+
     def drop(self, scene: str) -> None:
         """Offer a scene no longer. Streams of it go on, with its clips."""
         self.scenes.pop(scene, None)
@@ -419,6 +438,7 @@ class Connection:
         """The close code with which the client left, once it is known."""
         self._stream: Stream | None = None
         self._place: Place | None = None
+        self._scene: _Scene | None = None
         self._encoding: SampleEncoding = "f32"
         """How blocks without packets are sent."""
         self._block_encoding: BlockEncoding | None = None
@@ -599,6 +619,7 @@ class Connection:
         if levels is None:
             raise RequestError("unknown_scene", f"there is no scene {hello.scene!r}", field="scene", status=404)
         levels = levels.at_rate(hello.sample_rate)
+        self._scene = self._host.offered(hello.scene, levels)
         require_encoding(hello.encoding, levels.default.sample_rate)
         if hello.ambisonic_order is not None:
             levels = levels.with_directions(hello.level)
@@ -745,13 +766,24 @@ class Connection:
             return session, [], []
         errors, others = session.restore(lost.snapshot), []
         for kept in lost.snapshot.listeners:
-            message = kept.listener
             try:
-                number = self._roster.enter(message.id, kept.index)
-                others.append(self._new_listener(message, number, hello, levels, quality))
+                others.append(self._restored_listener(kept, hello, levels, quality))
             except RequestError as refusal:
-                errors.append(Error.from_refusal(refusal, listener=message.id))
+                errors.append(Error.from_refusal(refusal, listener=kept.listener.id))
         return session, others, errors
+
+    def _restored_listener(
+        self, kept: KeptListener, hello: Hello, levels: FieldsByLevel, quality: QualityStep
+    ) -> NewListener:
+        """A listener that a lost stream had. Raises RequestError as `_new_listener` does."""
+        message = kept.listener
+        number = self._roster.enter(message.id, kept.index)
+        try:
+            return self._new_listener(message, number, hello, levels, quality)
+        except RequestError:
+            # guard: who cannot be there again takes no seat and no name
+            self._roster.leave(message.id)
+            raise
 
     def _new_listener(
         self, message: AddListener, number: int, hello: Hello, levels: FieldsByLevel, quality: QualityStep
@@ -773,27 +805,25 @@ class Connection:
         listener: Pose | None = None,
         index: int = 0,
     ) -> Session:
-        host, rate = self._host, levels.default.sample_rate
+        host, scene = self._host, self._scene
+        assert scene is not None, "a hello comes before a session"
         filters, field_filters = host.head(hrtf, levels)
-        clips = host.clips[hello.scene].at_rate(rate)
-        # What effects cost is measured at the scene's own rate, and no plan says what is true of another.
-        costs = host.effect_costs.get(hello.scene, {}) if rate == levels.own_rate else {}
         return Session(
             hello,
             levels,
             filters,
-            lambda name: loaded_clip(clips, host.clip_store, name),
+            lambda name: loaded_clip(scene.clips, host.clip_store, name),
             quality=quality,
             max_emitters=host.settings.max_emitters,
             shared_tail=host.settings.shared_tail,
             window=window,
             place=place_of(
                 levels.bundle,
-                host.places[hello.scene].reverberations,
+                scene.reverberations,
                 block_size=hello.block_size,
-                sample_rate=rate,
+                sample_rate=levels.default.sample_rate,
             ),
-            costs=lambda bus: costs.get(bus, {}),
+            costs=lambda bus: scene.effect_costs.get(bus, {}),
             field_filters=field_filters,
             listener=listener,
             index=index,
@@ -939,8 +969,8 @@ class Connection:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
                 # Decoded here, off the event loop, so that the audio thread need not wait.
-                clips = self._host.clips[hello.scene].at_rate(stream.sample_rate)
-                await asyncio.to_thread(load_clip, clips, self._host.clip_store, message.clip)
+                assert self._scene is not None
+                await asyncio.to_thread(load_clip, self._scene.clips, self._host.clip_store, message.clip)
             if isinstance(message, AddListener):
                 await self._add_listener(message, stream, hello)
             else:
@@ -999,7 +1029,6 @@ class Connection:
         """Raises RequestError unknown_listener."""
         self._roster.leave(message.id)
         self._host.admission.remove_listener(place)
-        self._widen(-1)
         _logger.info("listener removed", extra={"listener": message.id})
 
     def _widen(self, listeners: int) -> None:
@@ -1090,6 +1119,8 @@ class Connection:
         for each in outgoing:
             if isinstance(each, EmitterEnded) and each.removed:
                 self._host.admission.remove_emitter(self._place)
+        if gone := {each.index for each in outgoing if isinstance(each, ListenerRemoved)}:
+            outgoing = self._let_go(gone, outgoing)
         blocks: list[bytes] = []
         if self._fast_path is not None and not (self._outgoing or self._is_sending):
             now_s = self._time_s()
@@ -1098,6 +1129,17 @@ class Connection:
                 blocks = []
         if len(blocks) < len(outgoing):
             self._enqueue(outgoing[len(blocks) :])
+
+    def _let_go(self, gone: Set[int], outgoing: Sequence[Outgoing]) -> list[Outgoing]:
+        """The output less the blocks of listeners who have left. Nor are those sent that wait, so that the others do
+        not lack the room."""
+
+        def is_wanted(each: Outgoing) -> bool:
+            return not (isinstance(each, TimedBlock) and each.block.listener in gone)
+
+        self._outgoing = deque(filter(is_wanted, self._outgoing))
+        self._widen(-len(gone))
+        return list(filter(is_wanted, outgoing))
 
     def _without_state(self, outgoing: list[Outgoing]) -> Iterator[Outgoing]:
         """The output less the state that was asked for, which is for this connection itself."""

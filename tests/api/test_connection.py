@@ -8,6 +8,7 @@ from itertools import count
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
+from server.api import connection
 from server.api.catalogue import open_clips
 from server.api.connection import Connection, StreamHost
 from server.api.inflow import LISTENER_COST
@@ -17,8 +18,17 @@ from server.api.web_socket import FastPath
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.places import place_of_field
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, AddListener, Hello, Ping, RemoveEmitter
-from server.protocol.server_messages import Error, ListenerAdded, Status, parse_server_message
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    AddListener,
+    Hello,
+    Ping,
+    RemoveEmitter,
+    RemoveListener,
+)
+from server.protocol.server_messages import Error, ListenerAdded, ListenerRemoved, Status, parse_server_message
 from server.runtime.drain import Drain
 from server.runtime.readiness import Readiness
 from server.runtime.thread_pool import ThreadPool
@@ -240,6 +250,41 @@ def test_a_listener_costs_its_client_and_waits_for_work_of_those_who_left(field,
     (refusal,) = asyncio.run(scenario())
     assert (refusal.code, refusal.listener, refusal.retry_after_s) == ("server_busy", "guest", 1)
     assert charged == [LISTENER_COST]
+
+
+def test_who_lets_listeners_go_while_it_reads_nothing_is_not_cut_off(field, hrtfs, monkeypatch):
+    """Their blocks wait no longer, so that the room for them can go too."""
+    monkeypatch.setattr(connection, "MAX_WAITING_ANSWERS", 20)
+    window, guests = Settings().window_blocks + HELLO.buffer_blocks, ("a", "b")
+
+    async def scenario():
+        socket = Socket()
+        async with hosting(field, hrtfs) as host:
+            driver = Connection(socket, host)
+            running = asyncio.create_task(driver.run())
+            socket.say(HELLO)
+            await asyncio.wait_for(socket.has_sent.wait(), 5)
+            socket.reads.clear()
+            for name in guests:
+                socket.say(AddListener(id=name, position=(1.0, 2.0, 1.0)))
+            await until(lambda: len(driver._outgoing) >= 3 * window - 5)
+            for name in guests:
+                socket.say(RemoveListener(id=name))
+            (stream,) = host.audio.streams
+            await until(lambda: len(stream.audience.members) == 1)
+            await asyncio.sleep(0.1)  # some blocks more
+            waiting = len(driver._outgoing)
+            socket.reads.set()
+            await until(lambda: len(told(socket, ListenerRemoved)) == 2 or running.done())
+            await socket.close(1000, "")
+            await running
+        return socket, waiting
+
+    socket, waiting = asyncio.run(scenario())
+    assert codes(socket) == []
+    assert waiting <= window + 20
+    mine = [block.sequence for block in told(socket, AudioBlock) if block.listener == 0]
+    assert mine == list(range(len(mine)))
 
 
 def test_before_the_server_is_warm_a_client_is_told_to_come_back(field, hrtfs):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from server.core.errors import RequestError
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import (
     PROTOCOL,
@@ -189,3 +190,56 @@ def test_a_resumed_stream_has_its_three_listeners_again(client):  # noqa: F811
         assert place.listeners == 3
         assert resumed.refused(AddListener(id="guest", position=FAR)).code == "duplicate_listener"
         assert resumed.add("fourth").index == 3
+
+
+def test_a_listener_whose_head_is_gone_when_the_stream_is_resumed_takes_no_seat(client, monkeypatch):  # noqa: F811
+    host = client.app_state["host"]
+    with client.websocket_connect("/v1/stream") as socket:
+        party = Party(socket)
+        party.add("guest", hrtf="kemar")
+        party.add("third")
+        last = party.until(AudioBlock, lambda block: block.listener == 2)
+        socket.close(1012)
+    load, asked = host.hrtfs.filters, []
+
+    def filters(name, rate):
+        asked.append(name)
+        if len(asked) == 3:  # for the second of the sessions, each of which asks for two rates
+            raise RequestError("unknown_hrtf", f"there is no head {name!r}", field="hrtf", status=404)
+        return load(name, rate)
+
+    again = Resume(
+        protocol=PROTOCOL, token=party.welcome.resume_token, sequence=last.sequence, sample_clock=last.sample_clock
+    )
+    with client.websocket_connect("/v1/stream") as socket, monkeypatch.context() as patched:
+        patched.setattr(host.hrtfs, "filters", filters)
+        resumed = Party(socket, again)
+        patched.undo()
+        assert [each.id for each in resumed.welcome.resumed.listeners] == ["third"]
+        resumed.names[2] = "third"
+        told = resumed.until(Error)
+        assert (told.code, told.listener) == ("unknown_hrtf", "guest")
+        (place,) = host.admission._places
+        assert place.listeners == 2
+        assert resumed.refused(RemoveListener(id="guest")).code == "unknown_listener"
+        assert place.listeners == 2
+        assert resumed.add("guest").index == 3
+        assert place.listeners == 3
+
+
+def test_who_joins_hears_the_scene_in_which_the_stream_is(client, monkeypatch):  # noqa: F811
+    """Though another has its name by now, or none."""
+    host = client.app_state["host"]
+    with client.websocket_connect("/v1/stream") as socket:
+        party = Party(socket)
+        for offered in (host.clips, host.places, host.effect_costs, host.offers, host.scenes):
+            monkeypatch.delitem(offered, "flat", raising=False)
+        party.add("guest")
+        party.send(TALKER)
+        party.until(EmitterAdded)
+        party.loudness()
+        assert min(party.loudness().values()) > 0
+        (stream,) = host.audio.streams
+        first, guest = (member.session._effects.planned for member in stream.audience.members)
+        assert guest.place.reverberations is first.place.reverberations
+        assert guest._costs(None) == first._costs(None)
