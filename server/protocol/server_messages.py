@@ -161,7 +161,8 @@ class ListenerAdded(Message):
 
 
 class ListenerRemoved(Message):
-    """The listener with this number was removed, and its id is free. No block of it follows."""
+    """The listener with this number was removed, and its id is free. No block of it follows, and blocks that still
+    waited to be sent are left out."""
 
     type: Literal["listener_removed"] = "listener_removed"
     id: str
