@@ -42,6 +42,8 @@ class _Known:
     """How they were when they were last loaded, or could not be."""
     scene: str | None = None
     """Id of the scene that is served from here."""
+    served_before: str | None = None
+    """Id of the scene that was served from here before the last one was loaded."""
     is_refused: bool = False
 
 
@@ -67,6 +69,8 @@ class BundleFolder:
         loaded: dict[str, FieldsByLevel] = {}
         for path in self._known.keys() - stamps.keys():
             del self._known[path]
+        if before - self._served:
+            self._try_refused_again()
         for path, stamp in stamps.items():
             known = self._known.setdefault(path, _Known(seen=()))
             is_steady, known.seen = is_first or known.seen == stamp, stamp
@@ -76,7 +80,7 @@ class BundleFolder:
             levels = self._load(path)
             known.is_refused = levels is None
             if levels is not None:
-                known.scene = levels.bundle.id
+                known.served_before, known.scene = known.scene, levels.bundle.id
                 loaded[known.scene] = levels
         gone = before - self._served
         restored = {scene: self._others[scene] for scene in gone & self._others.keys()}
@@ -91,9 +95,17 @@ class BundleFolder:
         return self._others.get(scene)
 
     def refuse(self, path: Path) -> None:
-        """Count the bundle of a sub-folder as one that cannot be served as it is now."""
+        """Count the bundle of a sub-folder that was loaded last as one that cannot be served as it is now. Another
+        sub-folder may have its id."""
         if (known := self._known.get(path)) is not None:
-            known.is_refused = True
+            self._try_refused_again()
+            known.is_refused, known.scene = True, known.served_before
+
+    def _try_refused_again(self) -> None:
+        """Forget that bundles were refused, as an id may be free."""
+        for known in self._known.values():
+            if known.is_refused:
+                known.settled = None
 
     @property
     def _served(self) -> set[str]:

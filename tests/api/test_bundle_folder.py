@@ -101,6 +101,34 @@ def test_of_two_bundles_with_one_id_the_first_is_served(bundle, watched, caplog)
     assert looked(folder)[0] == {"hall": "B"}
 
 
+@pytest.mark.parametrize("has_failed", [False, True], ids=["is deleted", "cannot be served"])
+def test_where_the_first_of_two_with_one_id_goes_the_other_comes(bundle, watched, has_failed):
+    put(bundle, watched / "a", id="hall", name="First")
+    put(bundle, watched / "b", id="hall", name="Second")
+    folder = BundleFolder(watched, {})
+    assert folder.look(is_first=True).loaded.keys() == {"hall"}
+    if has_failed:
+        folder.refuse(watched / "a")
+    else:
+        shutil.rmtree(watched / "a")
+    loaded, _ = looked(folder)
+    assert loaded == {"hall": "Second"}
+    assert folder.refused == has_failed
+
+
+def test_a_newer_bundle_that_cannot_be_served_leaves_its_id_to_the_older(bundle, watched):
+    put(bundle, watched / "a", id="hall", name="Older")
+    folder = BundleFolder(watched, {})
+    folder.look(is_first=True)
+    put(bundle, watched / "a", id="hall", name="Newer")
+    assert looked(folder) == ({"hall": "Newer"}, set())
+    folder.refuse(watched / "a")
+    put(bundle, watched / "b", id="hall", name="Another")
+    assert looked(folder) == ({}, set())
+    shutil.rmtree(watched / "a")
+    assert looked(folder)[0] == {"hall": "Another"}
+
+
 def test_a_scene_that_was_replaced_comes_back(bundle, watched):
     usual = FieldsByLevel.load(bundle)
     folder = BundleFolder(watched, {"flat": usual})
