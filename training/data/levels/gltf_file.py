@@ -195,11 +195,15 @@ class _Reader:
             if not isinstance(node, dict):
                 raise self._fault(place, "is no object")
             above = np.eye(4) if parent < 0 else nodes[parent].to_file
+            with np.errstate(over="ignore", invalid="ignore"):
+                to_file = above @ self._transform(node, place)
+            if not np.isfinite(to_file).all():
+                raise self._fault(place, "its place and those above it multiply to no finite numbers")
             extras = node.get("extras")
             nodes.append(
                 Node(
                     str(node.get("name", "")),
-                    above @ self._transform(node, place),
+                    to_file,
                     parent,
                     extras if isinstance(extras, dict) else {},
                 )
@@ -232,7 +236,10 @@ class _Reader:
             attributes = primitive.get("attributes") if isinstance(primitive, dict) else None
             if not isinstance(attributes, dict):
                 raise self._fault(at, "has no attributes")
-            for name in primitive.get("extensions") or ():
+            extensions = primitive.get("extensions", {})
+            if not isinstance(extensions, dict):
+                raise self._fault(f"{at}.extensions", "is no object")
+            for name in extensions:
                 if name in GEOMETRY_EXTENSIONS:
                     raise self._fault(at, f"{name} {GEOMETRY_EXTENSIONS[name]}")
             if primitive.get("targets"):
@@ -252,7 +259,10 @@ class _Reader:
             if len(flat) and flat.max() >= len(points):
                 raise self._fault(f"{at}.indices", f"{flat.max()} is beyond the {len(points):,} vertices")
             triangles = _triangles(flat.astype(np.int64), mode)
-            yield points.astype(np.float64), triangles, self._material(primitive, at)
+            require_few(self.path, len(triangles))
+            # Every use of a mesh has vertices of its own, so what no triangle has could fill the memory.
+            used, corners = np.unique(triangles, return_inverse=True)
+            yield points[used].astype(np.float64), corners.reshape(-1, 3), self._material(primitive, at)
 
     def _material(self, primitive: _Json, place: str) -> str:
         if "material" not in primitive:
@@ -341,10 +351,14 @@ class _Reader:
         ):
             raise self._fault(place, f"{uri!r} leads out of the level's folder: put the file beside the level")
         folder = self.path.resolve().parent
-        file = (folder / name).resolve()
+        try:
+            file = (folder / name).resolve()
+            is_there = file.is_file()
+        except OSError as exc:
+            raise self._fault(place, f"the file {uri[:80]!r} cannot be looked for ({exc.strerror})") from exc
         if not file.is_relative_to(folder):
             raise self._fault(place, f"{uri!r} is a link out of the level's folder: put the file itself there")
-        if not file.is_file():
+        if not is_there:
             raise self._fault(place, f"there is no file {uri!r} beside the level")
         _require_size(file, self._bytes_read + file.stat().st_size)
         return file.read_bytes()

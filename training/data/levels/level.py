@@ -183,6 +183,9 @@ def level_of(path: Path, source: LevelSource, axes: Axes) -> Level:
         origin = to_world @ each.node.to_file[:3, 3]
         own = surfaces({index})
         if each.role is Role.DOOR:
+            if source.kind == "OBJ":
+                problem = "an OBJ file does not say where the hinge of this door is: export the level as glTF"
+                raise LevelError(path, each.node.name, problem)
             doors.append(_door(path, each, own, _point(origin), to_world))
         elif each.role is Role.EMITTER:
             emitters.append((each.name, _point(origin)))

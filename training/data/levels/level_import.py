@@ -127,8 +127,8 @@ def write_level(imported: ImportedLevel, folder: Path) -> None:
     from training.data.levels.mesh_figure import draw_mesh
 
     folder.mkdir(parents=True, exist_ok=True)
-    for old in (SCENE_FILE, MESH_FILE):
-        (folder / old).unlink(missing_ok=True)
+    for old in (folder / SCENE_FILE, folder / MESH_FILE, *folder.glob("door[0-9]*.npz")):
+        old.unlink(missing_ok=True)
     report = imported.report
     (folder / REPORT_FILE).write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
     title = f"{report.source}: " + (f"refused: {report.problems[0]}" if report.problems else "imported")

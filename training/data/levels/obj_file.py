@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from training.data.levels.level_source import (
     MOST_FILE_BYTES,
@@ -64,12 +65,24 @@ def read_obj(path: Path) -> LevelSource:
     if len(names) > MOST_NODES:
         raise LevelError(path, "objects", f"{len(names):,}, and at most {MOST_NODES:,}: join what stands still")
     places = np.frombuffer(vertices, dtype=np.float64).reshape(-1, 3) if vertices else np.zeros((0, 3))
+    numbers = {name: number for number, name in enumerate(names)}
     parts = []
+    lowest, highest = np.full((2, len(names), 3), np.inf) * np.array([1, -1])[:, None, None]
     for (name, material), held in faces.items():
         used, triangles = np.unique(np.frombuffer(held, dtype=np.int64), return_inverse=True)
-        parts.append(Part(names.index(name), places[used], triangles.reshape(-1, 3), material))
-    nodes = tuple(Node(name, np.eye(4)) for name in names)
+        part = Part(numbers[name], places[used], triangles.reshape(-1, 3), material)
+        lowest[part.node] = np.minimum(lowest[part.node], part.vertices.min(axis=0))
+        highest[part.node] = np.maximum(highest[part.node], part.vertices.max(axis=0))
+        parts.append(part)
+    nodes = tuple(map(Node, names, map(_placed_at, lowest / 2 + highest / 2)))
     return LevelSource("OBJ", nodes, tuple(parts), tuple(dict.fromkeys(notes)))
+
+
+def _placed_at(point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(4, 4) placement of a node. An object of an OBJ file has none, so it is in the middle of its vertices."""
+    placement = np.eye(4)
+    placement[:3, 3] = point
+    return placement
 
 
 def _corner(text: str, known: int) -> int:

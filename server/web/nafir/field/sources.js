@@ -23,7 +23,7 @@ export class ClipSource {
     const samples = this.#samples;
     if (!samples || samples.length === 0) return;
     for (let i = 0; i < block.length; i++) {
-      if (this.#at === samples.length) {
+      if (this.#at >= samples.length) {
         if (!this.#loop) return;
         this.#at = 0;
       }

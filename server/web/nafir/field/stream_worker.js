@@ -9,11 +9,14 @@ const now = () => performance.timeOrigin + performance.now();
 let stream = null;
 let field = null;
 let ticking = 0;
-const sounds = new Map(); // clips that were given before
+const sounds = new Map(); // clips that were given before, at the rate of the newest stream
+let soundsRate = 0;
 const taps = new Map();
 
 function open({ server, key, hello, listener, emitters, port }) {
   end();
+  if (hello.sampleRate !== soundsRate) sounds.clear();
+  soundsRate = hello.sampleRate;
   const tell = (type) => (detail) => self.postMessage({ type, detail });
   const worker = new Worker(new URL("./field_worker.js", import.meta.url), { type: "module" });
   field = worker;

@@ -172,6 +172,7 @@ def test_a_refused_level_is_drawn_and_no_scene_of_it_is_left(tmp_path):
     write_glb(path, [room()])
     write_level(import_level(path, Choices()), folder)
     assert LevelScene.read(folder).mesh.volume_m3 == pytest.approx(5 * 2.6 * 4)
+    (folder / "door0.npz").write_bytes(b"of an import before")
     open_mesh(path)
     imported, reason = outcome(path)
     write_level(imported, folder)

@@ -143,6 +143,7 @@ def spoil(document, *keys, value):
         (("scenes", 0, "nodes"), ["x"], "scenes"),
         (("nodes",), {}, "nodes"),
         (("meshes", 0, "primitives", 0, "indices"), 0, r"accessors\.0"),
+        (("meshes", 0, "primitives", 0, "extensions"), 5, r"meshes\.0\.primitives\.0\.extensions"),
         (("asset", "version"), "1.0", r"asset\.version"),
         (("extensionsRequired",), ["XYZ_shape"], "XYZ_shape"),
     ],
@@ -203,3 +204,24 @@ def test_a_glb_says_its_own_length(tmp_path):
 def write(path, data):
     path.write_bytes(data)
     return path
+
+
+def test_vertices_that_no_triangle_has_are_left_out(glb):
+    """Every use of a mesh holds its vertices, so a few hundred kilobytes could fill the memory."""
+    vertices, triangles = box()
+    many = np.concatenate([vertices, np.zeros((1000, 3))])
+    path = glb(WrittenNode("a", (Piece(many, triangles, "brick"),)))
+    assert len(read_gltf(path).parts[0].vertices) == len(vertices)
+
+
+def test_places_that_grow_beyond_all_numbers_are_refused(glb):
+    inner = WrittenNode("emitter_a", (), {"translation": [1e200, 0, 0]})
+    with pytest.raises(LevelError, match="no finite numbers"):
+        read_gltf(glb(WrittenNode("outer", (), {"scale": [1e200] * 3}, {}, (inner,)), room()))
+
+
+def test_a_file_whose_name_is_too_long_is_told(tmp_path):
+    document, _ = gltf_of([room()])
+    document["buffers"][0]["uri"] = "a" * 5000
+    with pytest.raises(LevelError, match="cannot be looked for"):
+        read_gltf(write(tmp_path / "a.gltf", json.dumps(document).encode()))

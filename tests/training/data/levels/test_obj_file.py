@@ -3,6 +3,8 @@ import pytest
 import trimesh
 
 from tests.training.data.levels.conftest import box
+from training.data.levels.axis_options import Handedness, Units, Up
+from training.data.levels.level import Axes, level_of
 from training.data.levels.level_source import LevelError
 from training.data.levels.obj_file import read_obj
 
@@ -53,3 +55,16 @@ def test_triangles_are_what_trimesh_reads(tmp_path):
 def test_faults_are_told_with_their_line(tmp_path, text, complaint):
     with pytest.raises(LevelError, match=complaint):
         read_obj(obj(tmp_path, text))
+
+
+def test_an_object_is_in_the_middle_of_its_vertices(tmp_path):
+    """An OBJ file places none. A door's hinge is not there, so it is asked for in another format."""
+    floor = "o floor\nv 0 0 0\nv 4 0 0\nv 0 4 0\nf 1 2 3\n"
+    radio = "o emitter_radio\nv 3 3 1\nv 3.2 3 1\nv 3 3.2 1\nf 4 5 6\n"
+    axes = Axes(Up.Z, Handedness.RIGHT, Units.M)
+    path = obj(tmp_path, floor + radio)
+    ((name, position),) = level_of(path, read_obj(path), axes).emitters
+    assert (name, position) == ("radio", pytest.approx((3.1, 3.1, 1.0)))
+    path = obj(tmp_path, floor + radio.replace("emitter_radio", "door_hall"))
+    with pytest.raises(LevelError, match="hinge"):
+        level_of(path, read_obj(path), axes)
