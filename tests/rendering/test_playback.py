@@ -85,7 +85,7 @@ def test_a_clip_is_played_to_the_sample(playback, size):
     if stops is not None:
         engine.stop_emitter("a", stops, fade=playback["fade"])
     heard = hear(engine, 12)
-    np.testing.assert_allclose(heard, expected(samples=heard.size, **playback), atol=1e-6)
+    np.testing.assert_allclose(heard, expected(samples=heard.size, **playback), rtol=1e-6, atol=1e-6)
 
 
 @BOTH_KINDS
