@@ -1,5 +1,7 @@
 """Several listeners of one stream, over a WebSocket of the whole application."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,18 @@ from tests.api.test_stream import client, clip_files  # noqa: F401  fixtures
 HELLO = Hello(protocol=PROTOCOL, scene="flat", listeners=3)
 NEAR, FAR = (2.0, 3.2, 1.5), (7.0, 1.0, 1.5)
 TALKER = AddEmitter(id="talker", clip="tone", position=(2.0, 3.0, 1.5))
+
+
+def lose(socket, client):  # noqa: F811
+    """End a connection as a network does, and wait until its stream is kept: leaving the context cancels the server."""
+    kept = client.app_state["host"].kept
+    before = kept.outcomes["kept"]
+    socket.close(1012)
+    for _ in range(500):
+        if kept.outcomes["kept"] > before:
+            return
+        time.sleep(0.01)
+    raise AssertionError("the stream was not kept within 5 s")
 
 
 class Party:
@@ -170,7 +184,7 @@ def test_a_resumed_stream_has_its_three_listeners_again(client):  # noqa: F811
         party.send(ListenerPose(pose_id=5, position=NEAR, listener="guest"))
         party.until(AudioBlock, lambda block: block.listener == 1 and block.pose_id == 5)
         last = party.blocks[-1]
-        socket.close(1012)
+        lose(socket, client)
     newest = max(block.sequence for block in party.blocks)
     again = Resume(protocol=PROTOCOL, token=party.welcome.resume_token, sequence=newest, sample_clock=last.sample_clock)
     with client.websocket_connect("/v1/stream") as socket:
@@ -199,7 +213,7 @@ def test_a_listener_whose_head_is_gone_when_the_stream_is_resumed_takes_no_seat(
         party.add("guest", hrtf="kemar")
         party.add("third")
         last = party.until(AudioBlock, lambda block: block.listener == 2)
-        socket.close(1012)
+        lose(socket, client)
     load, asked = host.hrtfs.filters, []
 
     def filters(name, rate):
