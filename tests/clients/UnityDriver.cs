@@ -72,6 +72,7 @@ static class UnityDriver
             case "play": return Play(words.Select(each => (double)Number(each)).ToArray());
             case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]));
             case "shots": return Shots(words[0], words[1], words[2]);
+            case "ending": return Ending(words[0], words[1], words[2]);
             case "microphone": return FromMicrophone(words[0], words[1]);
             case "components": return Components(words[0], words[1]);
             default: throw new ArgumentException(command);
@@ -221,6 +222,30 @@ static class UnityDriver
             for (int i = 0; i < 800 && ended.Count < 6; i++) Thread.Sleep(10);
             return $"{ended.Count} {string.Join(",", wanted.Except(ended))} {string.Join(",", refused)}";
         }
+    }
+
+    // A thing whose script runs before the camera's plays a clip that ends. Answers with whether it has ended, and the emitters there are then.
+    static string Ending(string url, string scene, string clip)
+    {
+        var camera = new NafirClient { url = url, scene = scene };
+        camera.transform.position = new Vector3(2, 1.5f, 2.5f);
+        var thing = new NafirEmitter { client = camera, clip = clip, loop = false };
+        thing.transform.position = new Vector3(3, 1.5f, 3);
+        var hasEnded = false;
+        thing.Ended += () => hasEnded = true;
+        Call(camera, "OnEnable");
+        Call(thing, "OnEnable");
+        for (int frame = 0; frame < 1200 && !hasEnded; frame++)
+        {
+            Thread.Sleep(10);
+            Call(thing, "Update");
+            if (frame == 60) thing.Stop();
+            if (frame % 20 == 0) Call(camera, "Update"); // seldom: the thing's script runs between the end and the news of it
+        }
+        var emitters = (ICollection)typeof(NafirStream).GetField("emitters", BindingFlags.Instance | BindingFlags.NonPublic).GetValue(camera.Stream);
+        var there = emitters.Count;
+        foreach (var each in new object[] { thing, camera }) Call(each, "OnDisable");
+        return $"{hasEnded} {there}";
     }
 
     // A game whose microphone hears a tone. Answers with the loudest that comes back in three seconds.

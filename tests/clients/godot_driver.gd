@@ -41,7 +41,7 @@ func _initialize():
 	var vectors = JSON.parse(file.get_as_text()).result
 	var is_right = (
 		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
-		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
 	)
 	print("checked %d" % _checked)
 	quit(0 if is_right else 1)
@@ -124,6 +124,40 @@ func _texts(core):
 	for each in stream.texts:
 		print(to_json(each))
 	return _equal("a pose was sent", stream.packets.size(), 1)
+
+
+# More is ordered than is kept for a resumed stream. It goes on if the server has handled what is gone, and begins anew if not.
+func _resuming(core):
+	for handled in [1101.0, 0.0]:
+		var stream = core.new()
+		stream.begin()
+		stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "t"})
+		stream.set_emitter("x", "trumpet", core.make_pose(Vector3(), Quat(0, 0, 0, 1)), 0.0)
+		for index in range(1100):
+			stream.set_gain("x", -0.01 * index)
+		stream.lost("a cut")
+		stream.set_gain("x", -20.0)
+		if not (_equal("first", stream.first_message().type, "resume") and _equal("waits", stream.step(2.0), "connect")):
+			return false
+		stream.begin()
+		stream.receive({
+			"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "u",
+			"resumed": {"handled": handled, "sample_clock": 5000.0, "pose_id": 0.0},
+		})
+		if handled > 0.0:
+			if not (_equal("goes on", stream.step(0.01), "") and _equal("is live", stream.state, "live") and _equal("said", stream.texts.size(), 1)):
+				return false
+			continue
+		if not (_equal("cannot go on", stream.step(0.01), "drop") and _equal("waits", stream.state, "waiting")):
+			return false
+		stream.lost("dropped")
+		if not (_equal("anew", stream.first_message().type, "hello") and _equal("connects", stream.step(2.0), "connect")):
+			return false
+		stream.begin()
+		stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "v"})
+		if not (_equal("is live", stream.state, "live") and _equal("the emitter is said", stream.texts.size(), 1)):
+			return false
+	return true
 
 
 # A microphone's frames at 44.1 kHz become samples at 24 kHz, two frames later.

@@ -229,6 +229,10 @@ def test_one_shots_and_what_is_stopped_end_and_a_refusal_is_told(program, served
     assert answers(program, f"shots ws://{served}/v1/stream flat trumpet") == ["6  unknown_clip"]
 
 
+def test_a_clip_that_has_ended_does_not_begin_again_before_the_game_is_told(program, served):
+    assert answers(program, f"ending ws://{served}/v1/stream flat trumpet") == ["True 0"]
+
+
 def test_a_microphone_is_heard(program, served):
     [loudest] = answers(program, f"microphone ws://{served}/v1/stream flat")
     assert float(loudest) > 1e-3

@@ -142,6 +142,10 @@ def test_json_is_read_as_python_reads_it(program):
     assert set(answers(program, *(f"json {text}" for text in broken))) == {"refused"}
 
 
+def test_a_stream_goes_on_if_the_server_has_handled_the_orders_that_are_gone(program):
+    assert answers(program, "resume 1101", "resume 0") == ["resume go on 1 resume", "resume drop 0 hello"]
+
+
 def test_the_component_is_of_the_engines_types():
     """By stand-ins for them: that it is C++, and what it takes for granted of the engine, is all that this says."""
     stub = Path(__file__).with_name("unreal_stub")

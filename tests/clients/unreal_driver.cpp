@@ -10,6 +10,7 @@
 #include "Json.h"
 #include "Playback.h"
 #include "Pose.h"
+#include "Session.h"
 #include "Wire.h"
 
 namespace {
@@ -91,6 +92,34 @@ void Play(std::istream& in) {
   std::cout << playback.underruns() << ' ' << heard << '\n';
 }
 
+// More is ordered than is kept for a resumed stream, of which the server has handled so much. Answers with the kind of the first message,
+// what is to be done once the stream is resumed, how many messages there are to say, and the first message after that connection is lost.
+void Resume(std::istream& in) {
+  std::string handled;
+  in >> handled;
+  const auto name = [](const std::string& message) { return nafir::Json::Parse(message)->operator[]("type").Text(); };
+  const std::string welcome = R"({"type":"welcome","sample_rate":24000,"level":"standard","resume_token":"t")";
+  nafir::Session session({});
+  session.Begin();
+  session.Receive(welcome + "}");
+  nafir::Source source;
+  source.clip = "trumpet";
+  session.SetEmitter("x", source);
+  for (int i = 0; i < 1100; ++i) session.SetGain("x", -0.01 * i);
+  session.Lost("a cut");
+  session.SetGain("x", -20);
+  std::cout << name(session.FirstMessage()) << ' ';
+  session.Step(2);
+  session.Begin();
+  session.Receive(welcome + R"(,"resumed":{"handled":)" + handled + R"(,"sample_clock":5000,"pose_id":0}})");
+  std::cout << (session.Step(0.01) == nafir::Session::Todo::kDrop ? "drop " : "go on ");
+  int said = 0;
+  while (session.Take()) ++said;
+  std::cout << said << ' ';
+  session.Lost("another");
+  std::cout << name(session.FirstMessage()) << '\n';
+}
+
 }  // namespace
 
 int main() {
@@ -169,6 +198,8 @@ int main() {
       std::cout << (read ? Written(*read) : "refused") << '\n';
     } else if (command == "play") {
       Play(in);
+    } else if (command == "resume") {
+      Resume(in);
     }
     std::cout.flush();
   }

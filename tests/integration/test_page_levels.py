@@ -1,6 +1,7 @@
 """Quality levels on the page: the frontier is a picture to choose from while one listens."""
 
 import re
+import time
 import urllib.request
 from collections.abc import Iterator
 
@@ -63,15 +64,21 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
 
     start(page)
     page.wait_for_function("nafir.state().level !== null")
-    page.select_option("#level-choice", "quick")
-    page.wait_for_function("nafir.state().level === 'quick'")
+    # A busy server may be at that level already, or leave it: then nothing changes, or other messages take its place.
+    changes = page.locator("#level-changes li", has_text="as you chose")
+    for _ in range(5):
+        page.select_option("#level-choice", "fine")
+        page.wait_for_function("nafir.state().level === 'fine'")
+        page.select_option("#level-choice", "quick")
+        page.wait_for_function("nafir.state().level === 'quick'")
+        change = changes.filter(has_text="At most 20")
+        if change.count():
+            break
     assert page.inner_text("#level") == "At most 20 responses a second"
     assert page.get_attribute("#level", "title") == "quick"
     assert page.locator("#frontier .heard").get_attribute("data-level") == "quick"
-    # A busy machine may have changes of its own.
-    change = page.locator("#level-changes li", has_text="as you chose")
-    assert re.fullmatch(r"\d\d:\d\d:\d\d ?At most 20 responses a second.*: as you chose", change.inner_text())
-    assert change.get_attribute("title") == "quick"
+    assert re.fullmatch(r"\d\d:\d\d:\d\d ?At most 20 responses a second.*: as you chose", change.first.inner_text())
+    assert change.first.get_attribute("title") == "quick"
     page.locator("#frontier [data-level=fine] .touch").click()
     page.wait_for_function("nafir.state().level === 'fine'")
     assert page.input_value("#level-choice") == "fine"
@@ -89,10 +96,14 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
 
 
 def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_levels):
-    def streams() -> float:
-        metrics = urllib.request.urlopen(f"{several_levels}/metrics", timeout=10).read().decode()
-        counts = re.findall(r"^nafir_streams\{.*\} ([0-9.]+)$", metrics, re.MULTILINE)
-        return sum(map(float, counts))
+    def wait_for_streams(wanted: int) -> None:  # those of pages that have gone end in their time
+        for _ in range(100):
+            metrics = urllib.request.urlopen(f"{several_levels}/metrics", timeout=10).read().decode()
+            counts = re.findall(r"^nafir_streams\{.*\} ([0-9.]+)$", metrics, re.MULTILINE)
+            if sum(map(float, counts)) == wanted:
+                return
+            time.sleep(0.1)
+        raise AssertionError(counts)
 
     context = browser.new_context(viewport={"width": 1280, "height": 900})
     complaints: list[str] = []
@@ -112,13 +123,13 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     page.evaluate("nafir.setListener({ x: 2.6 })")
     state = page.evaluate("nafir.state()")
     assert (state["connection"], state["output"], state["effects"]) == ("live", "ambisonics", None)
-    assert streams() == 0
+    wait_for_streams(0)
 
     page.select_option("#level-choice", "standard")
     page.wait_for_function("nafir.state().level === 'standard'")
     assert page.inner_text("#part-server-name") == "Server and network"
     assert page.locator("#frontier .in-browser.heard").count() == 0
-    assert streams() == 1
+    wait_for_streams(1)
     assert level_db(listen(page)).max() > -60
     assert complaints == []
     context.close()

@@ -69,6 +69,7 @@ var _silent_s = 0.0
 var _wait_s = 0.0
 var _attempt = 0
 var _is_trying = false # while there is a connection that has not been welcomed
+var _is_to_drop = false # a connection that resumed a stream which cannot go on
 var _since_lost_s = 0.0
 var _since_block_s = 0.0
 var _last_error = null # of the whole stream, in this connection
@@ -278,6 +279,7 @@ func lost(why, code = 0):
 	texts.clear()
 	packets.clear()
 	_is_trying = false
+	_is_to_drop = false
 	if state == "live":
 		_attempt = 0
 		_since_lost_s = 0.0
@@ -334,6 +336,8 @@ func step(delta_s):
 	_since_block_s += delta_s
 	if state != "live":
 		_since_lost_s += delta_s
+	if _is_to_drop:
+		return "drop"
 	if state == "waiting" and not _is_trying:
 		_wait_s -= delta_s
 		return "connect" if _wait_s <= 0.0 else ""
@@ -413,9 +417,13 @@ func _welcome(message):
 	_listener_moved = true
 	_is_trying = false
 	_attempt = 0
+	var resumed = message.get("resumed")
+	if resumed != null and int(resumed["handled"]) < _ordered - _orders.size():
+		_forget() # some of what was said is gone, so the stream begins anew
+		_is_to_drop = true
+		return
 	if statistics.blocks > 0:
 		statistics.reconnections += 1
-	var resumed = message.get("resumed")
 	state = "live" # so that what follows is said; the game is told once it has been
 	if resumed != null:
 		_go_on(int(resumed["handled"]), int(resumed["sample_clock"]), int(resumed["pose_id"]))
@@ -616,8 +624,6 @@ func _order(message):
 	_ordered += 1
 	if _orders.size() > MOST_ORDERS:
 		_orders.pop_front()
-		if state != "live":
-			_forget() # too much was said to go on with the stream
 	if state == "live":
 		texts.append(message)
 

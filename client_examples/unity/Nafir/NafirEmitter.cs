@@ -79,8 +79,14 @@ namespace Nafir
                 if (listened != null) listened.EmitterEnded += OnEmitterEnded;
             }
             if (!wanted) return;
-            known = client != null ? client.Stream : null;
-            known?.SetEmitter(id, new NafirSource { Clip = clip == "" ? null : clip, GainDb = gainDb, Loop = loop, Pose = client.PoseOf(transform), RemoveWhenEnded = true });
+            var stream = client != null ? client.Stream : null;
+            if (stream != null)
+            {
+                var source = new NafirSource { Clip = clip == "" ? null : clip, GainDb = gainDb, Loop = loop, Pose = client.PoseOf(transform), RemoveWhenEnded = true };
+                if (stream == known) stream.ChangeEmitter(id, source); // one that has ended does not begin again before it is told
+                else stream.SetEmitter(id, source);
+            }
+            known = stream;
         }
 
         void OnEmitterEnded(string ended)

@@ -162,6 +162,15 @@ namespace Nafir
             }
         }
 
+        /// <summary>As <see cref="SetEmitter"/>, for an emitter that is there. One that has ended stays away.</summary>
+        public void ChangeEmitter(string id, NafirSource source)
+        {
+            lock (gate)
+            {
+                if (emitters.ContainsKey(id)) SetEmitter(id, source);
+            }
+        }
+
         /// <summary>Plays a clip once at a place, as soon as it can be heard or from a clock on. Returns the id of its emitter, which is removed
         /// once the clip and its reverberation are over.</summary>
         public string PlayOneShot(string clip, NafirPose pose, float gainDb = 0, ulong? startAt = null)

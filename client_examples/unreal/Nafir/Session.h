@@ -181,7 +181,7 @@ class Session {
   // The connection has ended, with a close code if there was one, or there came none.
   void Lost(const std::string& why, int code = 0) {
     outgoing_.clear();
-    is_trying_ = false;
+    is_trying_ = is_to_drop_ = false;
     const bool was_live = state_ == State::kLive;
     if (was_live) {
       attempt_ = 0;
@@ -212,6 +212,7 @@ class Session {
     step_s_ = seconds;
     since_block_s_ += seconds;
     if (state_ != State::kLive) since_lost_s_ += seconds;
+    if (is_to_drop_) return Todo::kDrop;
     if (state_ == State::kWaiting && !is_trying_) {
       wait_s_ -= seconds;
       return wait_s_ <= 0 ? Todo::kConnect : Todo::kNothing;
@@ -361,10 +362,15 @@ class Session {
       playing_.store(playbacks_.back().get(), std::memory_order_release);
       playback_rate_ = sample_rate_;
     }
+    const Json& resumed = message["resumed"];
+    if (resumed.IsObject() && Count(resumed["handled"]) < ordered_ - orders_.size()) {
+      Forget();  // some of what was said is gone, so the stream begins anew
+      is_to_drop_ = true;
+      return;
+    }
     if (was_welcomed_) ++counts_.reconnections;
     was_welcomed_ = true;
     state_ = State::kLive;  // so that what follows is said; the game is told once it has been
-    const Json& resumed = message["resumed"];
     if (resumed.IsObject()) {
       GoOn(Count(resumed["handled"]), Count(resumed["sample_clock"]), static_cast<std::uint32_t>(Count(resumed["pose_id"])));
     } else {
@@ -484,10 +490,7 @@ class Session {
     if (state_ != State::kLive && !CanResume()) return;
     orders_.push_back(text);
     ++ordered_;
-    if (orders_.size() > kMostOrders) {
-      orders_.pop_front();
-      if (state_ != State::kLive) return Forget();  // too much was said to go on with the stream
-    }
+    if (orders_.size() > kMostOrders) orders_.pop_front();
     if (state_ == State::kLive) outgoing_.push_back({true, text});
   }
 
@@ -511,6 +514,7 @@ class Session {
   Statistics counts_;
   Pose listener_;
   bool listener_moved_ = false, is_trying_ = false, was_welcomed_ = false;
+  bool is_to_drop_ = false;  // a connection that resumed a stream which cannot go on
   std::map<std::string, Emitter> emitters_;
   std::deque<Outgoing> outgoing_;
   std::deque<std::string> orders_;  // the newest messages that the server counts, and how many there were
