@@ -186,7 +186,7 @@ def create_app(
     app.include_router(health)
     app.include_router(documents)
     app.include_router(api)
-    install_openapi(app, is_protected=access is not None)
+    install_openapi(app, max_poses=settings.max_poses, is_protected=access is not None)
     app.add_middleware(Compression)
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     rate_limits = RateLimits.of(settings)

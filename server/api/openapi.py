@@ -86,25 +86,27 @@ _KEY: Final[Object] = {
 }
 
 
-def install_openapi(app: FastAPI, *, is_protected: bool = False) -> None:
+def install_openapi(app: FastAPI, *, max_poses: int, is_protected: bool = False) -> None:
     """Make the application's OpenAPI document the one from `describe`, computed once."""
 
     def openapi() -> Object:
         if app.openapi_schema is None:
-            app.openapi_schema = describe(app, is_protected=is_protected)
+            app.openapi_schema = describe(app, max_poses=max_poses, is_protected=is_protected)
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]  # as FastAPI's documentation has it
 
 
-def describe(app: FastAPI, *, is_protected: bool = False) -> Object:
-    """The document. With `is_protected` it says which operations need a key, and of what scopes one."""
+def describe(app: FastAPI, *, max_poses: int, is_protected: bool = False) -> Object:
+    """The document of a server that takes batches of at most so many poses. With `is_protected` it says which
+    operations need a key, and of what scopes one."""
     document: Object = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
     schemas["Problem"] = _PROBLEM
     batch = ResponseBatch.model_json_schema(ref_template="#/components/schemas/{model}")
+    batch["properties"]["poses"]["maxItems"] = max_poses
     schemas |= batch.pop("$defs")
     schemas[ResponseBatch.__name__] = batch
     if is_protected:

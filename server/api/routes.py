@@ -551,7 +551,7 @@ async def hrtfs(request: Request) -> dict[str, Any]:
 async def decoder(
     request: Request,
     hrtf: Annotated[str, Path(description="name of a head")],
-    sample_rate: Annotated[WholeNumber, Query(description="in Hz, one that streams have")],
+    sample_rate: Annotated[WholeNumber, Query(**_between(1, 10**9), description="in Hz, one that streams have")],
     order: Annotated[
         WholeNumber, Query(**_between(ORDERS[0], ORDERS[-1]), description="of the ambisonic channels")
     ] = ORDERS[0],

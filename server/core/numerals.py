@@ -9,14 +9,15 @@ import math
 import re
 from typing import Final
 
-DECIMAL: Final = (
-    r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE](-[0-9]{1,3}|\+?([0-9]{1,2}|1[0-9]{2}|2[0-5][0-9])))?"
-)
-"""A decimal number as a regular expression for JSON Schema. It matches only numbers that are finite in double
-precision, whatever their up to forty digits are. `parse_decimal` also takes the finite ones above 10^260, which no
-scene needs."""
+_EXPONENT: Final = r"([eE][+-]?([01]?[0-9]{1,2}|2[0-5][0-9]))?"
+DECIMAL: Final = rf"[+-]?([0-9]{{1,40}}(\.[0-9]{{0,40}})?|\.[0-9]{{1,40}}){_EXPONENT}"
+"""A decimal number as a regular expression for JSON Schema: what `parse_schema_decimal` reads. It matches only numbers
+that are finite in double precision, and of those only zeros are zero there, whatever their up to forty digits are."""
+ZERO: Final = rf"[+-]?(0{{1,40}}(\.0{{0,40}})?|\.0{{1,40}}){_EXPONENT}"
+"""Those of `DECIMAL` that are zero."""
 INTEGER: Final = r"[+-]?[0-9]{1,40}"
 
+_SCHEMA_DECIMAL: Final = re.compile(DECIMAL)
 _DECIMAL: Final = re.compile(r"[+-]?([0-9]{1,40}(\.[0-9]{0,40})?|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?")
 _INTEGER: Final = re.compile(INTEGER)
 _NOT_FINITE: Final = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE | re.ASCII)
@@ -29,6 +30,15 @@ def parse_decimal(text: str) -> float:
     if _DECIMAL.fullmatch(number) is None or math.isinf(float(number)):
         raise ValueError(f"{_quoted(text)} is {_fault(number)}")
     return float(number)
+
+
+def parse_schema_decimal(text: str) -> float:
+    """Read a number of the grammar `DECIMAL`: `parse_decimal` also takes the finite ones beyond its exponents. Raises
+    ValueError, as `parse_decimal` does."""
+    number = parse_decimal(text)
+    if _SCHEMA_DECIMAL.fullmatch(text.strip(" ")) is None:
+        raise ValueError(f"{_quoted(text)} is too large or too small")
+    return number
 
 
 def parse_integer(text: str) -> int:

@@ -20,7 +20,7 @@ from server.acoustics.spherical_harmonics import HIGHEST_ORDER, harmonic_count
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import computed_tag
 from server.core.errors import RequestError
-from server.core.numerals import DECIMAL, parse_decimal
+from server.core.numerals import DECIMAL, ZERO, parse_schema_decimal
 from server.core.wav import wav_bytes
 from server.field.field import AcousticField
 from server.rendering.hrtf import HeadFilters, kemar
@@ -42,8 +42,10 @@ MEDIA_TYPES: dict[IrFormat, str] = {
 
 POSITION_PATTERN = rf"^ *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
 """The texts that `parse_position` accepts, as a regular expression of JSON Schema."""
-ORIENTATION_PATTERN = rf"^ *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
-"""The texts that `parse_orientation` accepts if they are no zero, as a regular expression of JSON Schema."""
+ORIENTATION_PATTERN = (
+    rf"^(?! *{ZERO} *, *{ZERO} *, *{ZERO} *, *{ZERO} *$) *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
+)
+"""The texts that `parse_orientation` accepts, as a regular expression of JSON Schema."""
 
 
 def parse_position(text: str, field: str) -> Vector3:
@@ -56,11 +58,12 @@ def parse_orientation(text: str, field: str) -> Quaternion:
     """Parse a quaternion of any length but zero, as four decimal numbers between commas. Raises RequestError
     malformed_pose naming `field`."""
     components = _parse_numbers(text, "x,y,z,w", field)
-    try:
-        return Quaternion(*components)
-    except ValueError as exc:
-        # guard: a query's orientation is one
-        raise RequestError("malformed_pose", str(exc), field=field) from exc
+    largest = max(map(abs, components))
+    # guard: a query's orientation is one
+    if not largest:
+        raise RequestError("malformed_pose", f"{field}: a quaternion of length zero has no direction", field=field)
+    _, exponent = math.frexp(largest)  # by powers of two, which leaves the components' ratios exact
+    return Quaternion(*(math.ldexp(component, -exponent) for component in components))
 
 
 def _parse_numbers(text: str, names: str, field: str) -> list[float]:
@@ -70,7 +73,7 @@ def _parse_numbers(text: str, names: str, field: str) -> list[float]:
         number = {3: "three", 4: "four"}[count]
         raise RequestError("malformed_pose", f"{field}: {text!r} is not {number} numbers {names}", field=field)
     try:
-        return [parse_decimal(part) for part in parts]
+        return [parse_schema_decimal(part) for part in parts]
     except ValueError as exc:
         raise RequestError("malformed_pose", f"{field}: in {names} {exc}", field=field) from exc
 

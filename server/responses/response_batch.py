@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 from pydantic_core import PydanticCustomError
 
-from server.acoustics.geometry import Quaternion, orientations_of
+from server.acoustics.geometry import FARTHEST_M, Quaternion, orientations_of
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER, harmonic_count
 from server.core.errors import RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
@@ -45,8 +45,9 @@ BATCH_EXAMPLE: Final = {
     ],
     "format": "npz",
 }
+_Coordinate = Annotated[FiniteFloat, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _Place = Annotated[
-    tuple[FiniteFloat, FiniteFloat, FiniteFloat], Field(description="x, y, z in metres", examples=[[1.0, 2.0, 1.5]])
+    tuple[_Coordinate, _Coordinate, _Coordinate], Field(description="x, y, z in metres", examples=[[1.0, 2.0, 1.5]])
 ]
 _LEAST, _MOST = 1e-6, 1e6
 _Component = Annotated[FiniteFloat, Field(ge=-_MOST, le=_MOST)]

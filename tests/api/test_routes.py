@@ -343,6 +343,48 @@ def test_examples_of_answers_have_what_answers_have(shared_client, path):
         assert keys(example) == keys(answer)
 
 
+def test_every_number_of_a_query_is_taken_within_the_bounds_of_its_schema_and_nowhere_else(shared_client):
+    tried = 0
+    for path, operations in shared_client.get("/openapi.json").json()["paths"].items():
+        for each in operations.get("get", {}).get("parameters", ()):
+            schema = each["schema"]
+            if schema.get("type") not in {"number", "integer"}:
+                continue
+            tried += 1
+            for value, is_taken in (
+                (schema["minimum"], True),
+                (schema["maximum"], True),
+                (schema["minimum"] - 1, False),
+                (schema["maximum"] + 1, False),
+                ("1e162", False),
+            ):
+                asked = path.replace("{scene}", "flat").replace("{hrtf}", "kemar")
+                others = {**PLACES, "sample_rate": 24_000, "output": "ambisonics"}
+                own = {other["name"] for other in operations["get"]["parameters"] if other["in"] == "query"}
+                given = {name: text for name, text in others.items() if name in own and name != each["name"]}
+                answer = shared_client.get(asked, params={**given, each["name"]: value})
+                # A number that is taken may still ask for what there is not.
+                assert (answer.status_code != 422) == is_taken, (path, each["name"], value, answer.text)
+    assert tried >= 8
+
+
+def test_every_number_of_a_body_has_bounds_in_its_schema(shared_client):
+    def numbers(schema):
+        if isinstance(schema, list):
+            for inside in schema:
+                yield from numbers(inside)
+        if isinstance(schema, dict):
+            if schema.get("type") in {"number", "integer"}:
+                yield schema
+            yield from numbers(list(schema.values()))
+
+    schemas = shared_client.get("/openapi.json").json()["components"]["schemas"]
+    found = [*numbers(schemas["ResponseBatch"]), *numbers(schemas["PosePair"])]
+    assert len(found) >= 8
+    assert all({"minimum", "maximum"} <= set(each) for each in found)
+    assert schemas["ResponseBatch"]["properties"]["poses"]["maxItems"] == Settings().max_poses
+
+
 def test_every_parameter_and_json_answer_has_an_example(shared_client):
     for path, operations in shared_client.get("/openapi.json").json()["paths"].items():
         for operation in operations.values():
@@ -491,6 +533,7 @@ def test_the_noises_are_those_of_ambisonic_responses(directional_client):
         (IR, {**PLACES, "pitch_deg": "up"}, 422, "malformed_pose", "pitch_deg"),
         (IR, {**PLACES, "roll_deg": "1e9"}, 422, "malformed_pose", "roll_deg"),
         (IR, {**PLACES, "orientation": "0,0,0,0"}, 422, "malformed_pose", "orientation"),
+        (IR, {**PLACES, "orientation": "1e260,0,0,0"}, 422, "malformed_pose", "orientation"),
         (IR, {**PLACES, "orientation": "0,0,1"}, 422, "malformed_pose", "orientation"),
         (IR, {**PLACES, "orientation": "0,0,inf,1"}, 422, "malformed_pose", "orientation"),
         (IR, {**PLACES, "orientation": "0,0,1,1", "yaw_deg": 0}, 409, "contradicting_parameters", "orientation"),

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.core.numerals import DECIMAL, INTEGER, parse_decimal, parse_integer
+from server.core.numerals import DECIMAL, INTEGER, ZERO, parse_decimal, parse_integer, parse_schema_decimal
 
 NO_DECIMALS = [
     "",
@@ -70,9 +70,17 @@ def test_every_integer_is_read_as_python_writes_it(number):
 
 @given(st.from_regex(re.compile(DECIMAL), fullmatch=True))
 def test_what_the_grammar_takes_is_finite_and_what_it_says(text):
-    number = parse_decimal(text)
+    number = parse_schema_decimal(text)
     assert math.isfinite(number)
+    assert (number == 0) == (re.fullmatch(ZERO, text) is not None) == (Fraction(text) == 0)
     assert abs(Fraction(number) - Fraction(text)) <= abs(Fraction(text)) * Fraction(2) ** -52 + Fraction(5e-324)
+
+
+@pytest.mark.parametrize("text", ["1e260", "-1e300", "1e-260", "5e-324"])
+def test_numbers_beyond_the_grammar_of_schemas_are_read_from_files_alone(text):
+    assert parse_decimal(text) == float(text)
+    with pytest.raises(ValueError, match="is too large or too small"):
+        parse_schema_decimal(text)
 
 
 @given(st.from_regex(re.compile(INTEGER), fullmatch=True))

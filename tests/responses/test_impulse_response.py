@@ -1,5 +1,7 @@
 import io
 import json
+import math
+import re
 import time
 
 import netCDF4
@@ -7,6 +9,8 @@ import numpy as np
 import pytest
 import scipy.io.wavfile
 import soundfile
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from server.acoustics.geometry import Pose, Quaternion
@@ -19,6 +23,8 @@ from server.responses.full_response import FullResponse
 from server.responses.impulse_response import (
     IR_FORMATS,
     IR_OUTPUTS,
+    ORIENTATION_PATTERN,
+    POSITION_PATTERN,
     ImpulseResponse,
     IrQuery,
     parse_format,
@@ -222,7 +228,9 @@ def test_json_says_what_was_asked_for(directional, asked, channels, told):
         ({"orientation": "0,0,0,0"}, "malformed_pose", "orientation"),
         ({"orientation": "0,0,1"}, "malformed_pose", "orientation"),
         ({"orientation": "0,0,nan,1"}, "malformed_pose", "orientation"),
-        ({"orientation": "1e200,0,0,0"}, "malformed_pose", "orientation"),
+        ({"orientation": "0,0,0e9,-.0e-200"}, "malformed_pose", "orientation"),
+        ({"orientation": "1e260,0,0,0"}, "malformed_pose", "orientation"),
+        ({"orientation": "1e-260,0,0,0"}, "malformed_pose", "orientation"),
         ({"pitch_deg": float("nan")}, "malformed_pose", "pitch_deg"),
         ({"yaw_deg": float("inf")}, "malformed_pose", "yaw_deg"),
         ({"output": "stereo"}, "unknown_output", "output"),
@@ -273,6 +281,45 @@ def test_every_parameter_changes_the_tag(directional, other_head):
 
 def test_an_orientation_is_made_a_unit_quaternion():
     assert parse_orientation(" 0,0, 3,4e0", "orientation") == (0.0, 0.0, 0.6, 0.8)
+    assert parse_orientation("0,0,3e162,4e162", "orientation") == (0.0, 0.0, 0.6, 0.8)
+    assert parse_orientation("0,0,3e-259,4e-259", "orientation") == pytest.approx((0.0, 0.0, 0.6, 0.8))
+
+
+READ = {
+    "position": (re.compile(POSITION_PATTERN[1:-1]), parse_position),
+    "orientation": (re.compile(ORIENTATION_PATTERN.removeprefix("^").removesuffix("$")), parse_orientation),
+}
+PIECES = [
+    *("0", "7", ".0", "0e5", "1e162", "2E+259", "1e260", "1e-259", "1e-260"),
+    *("-", "+", ".", "e", " ", "\n", "٣"),
+]
+NEARLY_NUMBERS = st.one_of(
+    st.sampled_from(PIECES), st.lists(st.sampled_from(PIECES), min_size=1, max_size=3).map("".join)
+)
+
+
+def is_read(parse, text):
+    try:
+        components = parse(text, "place")
+    except RequestError:
+        return False
+    assert all(map(math.isfinite, components))
+    return True
+
+
+@pytest.mark.parametrize("kind", READ)
+@given(data=st.data())
+def test_whatever_the_schema_of_a_pose_admits_is_read(kind, data):
+    pattern, parse = READ[kind]
+    assert is_read(parse, data.draw(st.from_regex(pattern, fullmatch=True)))
+
+
+@pytest.mark.parametrize("kind", READ)
+@given(texts=st.lists(NEARLY_NUMBERS, min_size=2, max_size=5))
+def test_a_pose_is_read_exactly_if_its_schema_admits_it(kind, texts):
+    pattern, parse = READ[kind]
+    text = ",".join(texts)
+    assert is_read(parse, text) == (pattern.fullmatch(text) is not None)
 
 
 @pytest.mark.parametrize("output", IR_OUTPUTS)

@@ -136,6 +136,8 @@ def test_a_long_answer_is_never_held_whole(field, name):
         ({"poses": [POSES[0], POSES[1] | {"listener": "1,2,1.5"}]}, "malformed_pose", "poses[1].listener"),
         ({"poses": [POSES[0], POSES[1] | {"emitter": [1, 2, "x"]}]}, "malformed_pose", "poses[1].emitter[2]"),
         ({"poses": [POSES[0], POSES[1] | {"yaw": 1}]}, "malformed_request", "poses[1].yaw"),
+        ({"poses": [POSES[0] | {"emitter": [1e162, 2, 1.5]}]}, "malformed_pose", "poses[0].emitter[0]"),
+        ({"poses": [POSES[0] | {"listener": [10**400, 2, 1.5]}]}, "malformed_pose", "poses[0].listener[0]"),
         ({"poses": [POSES[0] | {"yaw_deg": 36_001}]}, "malformed_pose", "poses[0].yaw_deg"),
         ({"poses": [POSES[0] | {"orientation": [0, 0, 0, 0]}]}, "malformed_pose", "poses[0].orientation"),
         (
