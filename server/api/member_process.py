@@ -41,7 +41,7 @@ def _serve(told: dict[str, Any]) -> None:
 
     give_back_large_arrays()
     settings = checked_settings(told["options"])
-    configure_logs(settings.log_format, settings.log_level)
+    configure_logs(settings.log_format, settings.log_level, lines_per_min=settings.log_lines_per_min)
     drain = Drain(settings.drain_s)
     # Not among the arguments, which other users of the machine can see.
     peers = ProcessPeers(told["number"], tuple(told["ports"]), os.environ.pop(KEY_VARIABLE, None))

@@ -103,6 +103,9 @@ class Settings(BaseSettings):
     """How `nafir serve` writes its log to standard error: lines for people, or JSON for programs."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """The least important lines that are written."""
+    log_lines_per_min: Annotated[int, Field(ge=0)] = 600
+    """Lines of the log that may say the same for the same reason in a minute, by each process; then it says how many
+    were left out. 0 sets no limit."""
     traces_url: str | None = None
     """Where OpenTelemetry traces go, by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces. They need the extra
     `otel`."""

@@ -108,7 +108,7 @@ def serve(
 
     given = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf, "processes": processes}
     settings = checked_settings(given)
-    configure_logs(settings.log_format, settings.log_level)
+    configure_logs(settings.log_format, settings.log_level, lines_per_min=settings.log_lines_per_min)
     with contextlib.ExitStack() as opened:
         # Before the slow part, so that a port that cannot be bound is reported at once.
         listeners = [opened.enter_context(listener) for listener in bind(settings.host, settings.port)]

@@ -3,14 +3,22 @@
 Modules log through the standard library; what belongs to a line besides its text goes into `extra`. structlog only
 writes the lines: with a time, the level, and what `about` has bound for the request or stream at hand.
 
+Clients cannot fill a disk: of lines that say the same for the same reason, `BoundedHandler` writes so many in a minute,
+and then how many it has left out.
+
 Keys and tokens never come into a log. No module logs them; and if one did, or a library does, `hide` blots them out of
 the finished line, tracebacks included.
 """
 
+import contextlib
+import contextvars
 import logging
+import math
 import re
 import sys
-from collections.abc import MutableMapping
+import time
+from collections.abc import Callable, MutableMapping
+from dataclasses import dataclass
 from typing import Any, Final, Literal, TextIO
 
 import structlog
@@ -28,6 +36,12 @@ _SECRETS: Final = (
     (re.compile(r"((?:authorization|sec-websocket-protocol)\W{1,8})[^\s'\"\\,][^'\"\\\n]*", re.IGNORECASE), r"\1***"),
 )
 """What looks like a key, a token or a header with one, and what is written in its place. A key's id is no secret."""
+_REASON: Final = ("status", "code", "reason")
+"""Fields of a line that say why it is written."""
+_WINDOW_S: Final = 60.0
+_MOST_KINDS: Final = 256
+"""Kinds of lines that are counted apart from each other; all others count as one."""
+LEFT_OUT: Final = "lines left out"
 
 
 def hide(text: str) -> str:
@@ -69,10 +83,84 @@ def formatter(form: Form, *, colors: bool = False) -> logging.Formatter:
     )
 
 
-def configure_logs(form: Form, level: str, *, stream: TextIO | None = None) -> None:
-    """Write everything from `level` on to `stream`, standard error by default. A second call replaces the first."""
+@dataclass
+class _Window:
+    """Lines of one kind since `began_s`: how many came, and what to say of those that were not written."""
+
+    began_s: float
+    lines: int = 0
+    summary: logging.LogRecord | None = None
+
+
+class BoundedHandler(logging.StreamHandler[TextIO]):
+    """Writes at most so many lines of a kind in a minute; 0 sets no limit. Lines are of a kind if they say the same
+    (before their values are filled in) with the same status, code and reason. How many were left out is said with the
+    first line of any kind after that minute, and when the handler is closed."""
+
+    def __init__(self, stream: TextIO, *, most_per_min: int, time_s: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(stream)
+        self._most = most_per_min
+        self._time_s = time_s
+        self._windows: dict[tuple[object, ...], _Window] = {}
+        self._due_s: float | None = None
+        """When the first of the windows ends that lack lines."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self._most:
+            now_s = self._time_s()
+            if self._due_s is not None and now_s >= self._due_s:
+                self._tell(now_s)
+            if not self._is_written(record, now_s):
+                return
+        super().emit(record)
+
+    def close(self) -> None:
+        with self.lock or contextlib.nullcontext():
+            self._tell(math.inf)
+        super().close()
+
+    def _is_written(self, record: logging.LogRecord, now_s: float) -> bool:
+        kind = (record.name, str(record.msg), *(getattr(record, name, None) for name in _REASON))
+        if kind not in self._windows and len(self._windows) >= _MOST_KINDS:
+            kind = ()
+        window = self._windows.get(kind)
+        if window is None or now_s >= window.began_s + _WINDOW_S:
+            window = self._windows[kind] = _Window(now_s)
+        window.lines += 1
+        if window.lines <= self._most:
+            return True
+        if window.summary is None:
+            window.summary = _summary_of(record)
+            end_s = window.began_s + _WINDOW_S
+            self._due_s = end_s if self._due_s is None else min(self._due_s, end_s)
+        return False
+
+    def _tell(self, now_s: float) -> None:
+        """Say how many lines were left out in windows that have ended by now, and forget these."""
+        for kind, window in list(self._windows.items()):
+            if now_s < window.began_s + _WINDOW_S:
+                continue
+            del self._windows[kind]
+            if window.summary is not None:
+                window.summary.__dict__["lines"] = window.lines - self._most
+                # Without what the task at hand is about.
+                contextvars.Context().run(super().emit, window.summary)
+        lacking = [each.began_s + _WINDOW_S for each in self._windows.values() if each.summary is not None]
+        self._due_s = min(lacking, default=None)
+
+
+def _summary_of(record: logging.LogRecord) -> logging.LogRecord:
+    """A record that stands for others like this one, and refers to nothing of it."""
+    said = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": LEFT_OUT}
+    why = {name: getattr(record, name) for name in _REASON if getattr(record, name, None) is not None}
+    return logging.makeLogRecord({**said, "line": str(record.msg), **why})
+
+
+def configure_logs(form: Form, level: str, *, lines_per_min: int = 0, stream: TextIO | None = None) -> None:
+    """Write everything from `level` on to `stream`, standard error by default, and of a kind at most so many lines a
+    minute; 0 sets no limit. A second call replaces the first."""
     stream = sys.stderr if stream is None else stream
-    handler = logging.StreamHandler(stream)
+    handler = BoundedHandler(stream, most_per_min=lines_per_min)
     handler.setFormatter(formatter(form, colors=stream.isatty()))
     root = logging.getLogger()
     root.handlers[:] = [handler]

@@ -5,6 +5,7 @@ from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.testclient import TestClient, WebSocketDenialResponse
+from starlette.websockets import WebSocketDisconnect
 
 from server.api import request_log
 from server.api.problems import problem
@@ -93,9 +94,14 @@ def test_health_checks_have_lines_only_if_they_fail(client, logged):
 
 
 def test_a_refused_handshake_has_a_line(client, logged):
-    for query, status, code in (("?deny", 401, "key_required"), ("?close", 403, "origin_not_allowed")):
-        with pytest.raises((WebSocketDenialResponse, Exception)), client.websocket_connect(f"/v1/stream{query}"):
+    answers = (
+        ("?deny", WebSocketDenialResponse, 401, "key_required"),
+        ("?close", WebSocketDisconnect, 403, "origin_not_allowed"),
+    )
+    for query, refusal, status, code in answers:
+        with pytest.raises(refusal) as refused, client.websocket_connect(f"/v1/stream{query}"):
             pass
+        assert refused.type is refusal
         assert [line[:4] for line in logged()] == [("WEBSOCKET", "/v1/stream", status, code)]
     with client.websocket_connect("/v1/stream") as socket:
         headers = dict(socket.extra_headers)
@@ -107,8 +113,8 @@ def test_a_refused_handshake_has_a_line(client, logged):
 def test_who_is_refused_is_counted_once(client, counted):
     client.get("/v1/good")
     client.get("/v1/refused")
-    for query in ("?deny", "?close"):
-        with pytest.raises((WebSocketDenialResponse, Exception)), client.websocket_connect(f"/v1/stream{query}"):
+    for query, refusal in (("?deny", WebSocketDenialResponse), ("?close", WebSocketDisconnect)):
+        with pytest.raises(refusal), client.websocket_connect(f"/v1/stream{query}"):
             pass
     told = {refusal: count for refusal, count in counted.counts.items() if count}
     assert told == {("401", "key_required"): 1, ("403", "origin_not_allowed"): 1}

@@ -1,12 +1,16 @@
+import gc
 import io
 import json
 import logging
 import secrets
+import sys
+import weakref
 
+import numpy as np
 import pytest
 
 from server.api.api_keys import random_key
-from server.runtime.logs import about, begin_about, configure_logs, formatter, hide
+from server.runtime.logs import LEFT_OUT, BoundedHandler, about, begin_about, configure_logs, formatter, hide
 from tests.api.token_keys import token
 
 
@@ -107,6 +111,109 @@ def test_keys_and_tokens_are_blotted_out():
         assert "***" in hide(text)
 
 
+@pytest.fixture
+def bounded():
+    """A logger that writes three lines of a kind a minute, what it has written, and its clock."""
+    stream, clock = io.StringIO(), [0.0]
+    handler = BoundedHandler(stream, most_per_min=3, time_s=lambda: clock[0])
+    handler.setFormatter(formatter("json"))
+    logger = logging.getLogger("server.some.bounded")
+    logger.propagate = False
+    logger.setLevel("INFO")
+    logger.handlers[:] = [handler]
+
+    def written():
+        lines = [json.loads(line) for line in stream.getvalue().splitlines()]
+        stream.seek(0)
+        stream.truncate()
+        return lines
+
+    begin_about()
+    yield logger, written, clock
+    begin_about()
+    logger.handlers.clear()
+
+
+def refuse(log, code, times=1):
+    for number in range(times):
+        log.info("request", extra={"status": 400, "code": code, "path": f"/{number}"})
+
+
+def test_lines_of_one_reason_are_bounded_and_counted_and_others_are_written(bounded):
+    log, written, clock = bounded
+    refuse(log, "malformed_request", 1_000)
+    refuse(log, "doubled_header", 3)
+    for _ in range(9):
+        log.info("stream not opened", extra={"reason": "server_busy"})
+    log.warning("another matter")
+    said = [line for line in written() if line.get("reason") is None]
+    assert [line.get("path") for line in said] == ["/0", "/1", "/2", "/0", "/1", "/2", None]
+    clock[0] = 59.9
+    refuse(log, "malformed_request", 5)
+    assert written() == []
+    clock[0] = 60.0
+    begin_about(request_id="of the next request")
+    log.info("next")
+    summary, of_streams, following = written()
+    assert (of_streams["line"], of_streams["reason"], of_streams["lines"]) == ("stream not opened", "server_busy", 6)
+    del summary["timestamp"]
+    assert summary == {
+        "event": LEFT_OUT,
+        "line": "request",
+        "status": 400,
+        "code": "malformed_request",
+        "lines": 1_002,
+        "level": "info",
+        "logger": "server.some.bounded",
+    }
+    assert following["request_id"] == "of the next request"
+    refuse(log, "malformed_request", 4)
+    assert len(written()) == 3  # a new minute
+
+
+def test_every_line_is_written_or_counted_however_they_come(bounded):
+    log, written, clock = bounded
+    random = np.random.default_rng(0)
+    came = 3_000
+    for _ in range(came):
+        clock[0] += random.exponential(1.0)
+        refuse(log, f"code_{random.integers(20)}")
+    log.handlers[0].close()
+    said = written()
+    summaries = [line for line in said if line["event"] == LEFT_OUT]
+    assert sum(line["lines"] for line in summaries) + len(said) - len(summaries) == came
+    assert len(said) - len(summaries) <= 20 * 3 * (clock[0] / 60 + 1)
+
+
+def test_kinds_of_lines_take_no_memory_without_bound(bounded):
+    log, written, _ = bounded
+    for number in range(10_000):
+        log.info(f"a line of its own: {number}")  # noqa: G004  that is the case
+    assert len(log.handlers[0]._windows) <= 257
+    log.handlers[0].close()
+    assert 256 <= len(written()) <= 256 + 3 + 1
+
+
+def test_a_line_that_is_left_out_keeps_nothing_alive(bounded):
+    log, _, _ = bounded
+
+    class HeavyError(Exception):
+        pass
+
+    def fail():
+        failure = HeavyError()
+        try:
+            raise failure
+        except HeavyError:
+            handler = log.handlers[0]  # alone: pytest's own keeps what it has seen
+            handler.handle(log.makeRecord(log.name, logging.ERROR, "", 0, "failed", (), sys.exc_info()))
+        return weakref.ref(failure)
+
+    references = [fail() for _ in range(5)]
+    gc.collect()
+    assert [reference() for reference in references] == [None] * 5
+
+
 def test_other_text_stays_as_it_is():
     for text in ("", "nafir_keys", "the bearer of news", "GET /v1/scenes 200", "eyes.only.here", "key 0123456789ab"):
         assert hide(text) == text
@@ -122,12 +229,13 @@ def test_a_second_configuration_replaces_the_first_and_libraries_are_quiet(monke
     first, second = io.StringIO(), io.StringIO()
     try:
         configure_logs("json", "debug", stream=first)
-        configure_logs("json", "info", stream=second)
+        configure_logs("json", "info", stream=second, lines_per_min=2)
         logging.getLogger("server.test").debug("unimportant")
-        logging.getLogger("server.test").info("important")
+        for _ in range(3):
+            logging.getLogger("server.test").info("important")
         logging.getLogger("uvicorn.error").info("< Authorization: Bearer x")
     finally:
         for name, level in before.items():
             logging.getLogger(name).setLevel(level)
     assert first.getvalue() == ""
-    assert [json.loads(line)["event"] for line in second.getvalue().splitlines()] == ["important"]
+    assert [json.loads(line)["event"] for line in second.getvalue().splitlines()] == ["important"] * 2
