@@ -39,8 +39,8 @@ COPY server server
 # Without `training` beside it the package is the server alone, so its other command goes.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-deps . \
     && rm /opt/nafir/bin/nafir-train
-# What renders is compiled here, for this machine's processor, and kept beside its source; on another processor a
-# container compiles at its start, a matter of half a minute, and keeps that where NUMBA_CACHE_DIR says.
+# What renders is compiled here, for this machine's processor, and kept beside its source, where every container reads it. On
+# another processor a container compiles at its start, a matter of half a minute, and keeps that in /cache if it may write there.
 WORKDIR /
 RUN /opt/nafir/bin/python -c "from server.rendering.warm_up import warm_up; warm_up([256])" \
     && for scene in /opt/nafir/lib/python3*/site-packages/server/scene/bundles/*/; do \
@@ -64,6 +64,7 @@ ENV PATH=/opt/nafir/bin:/usr/local/bin:/usr/bin:/bin \
     LANG=C.UTF-8 \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
+    NUMBA_CACHE_DIR=/cache \
     NAFIR_HOST=0.0.0.0 \
     NAFIR_PORT=8000
 USER 10001:10001

@@ -25,7 +25,8 @@ SETTINGS = (
     *("etc/os-release", "usr/lib/os-release", "etc/debian_version"),
 )
 """Files of the system that libraries, or scanners of images, read."""
-EMPTY = "dev", "proc", "run", "sys", "tmp", "var/tmp"
+EMPTY = {**dict.fromkeys(("dev", "proc", "run", "sys"), 0o755), **dict.fromkeys(("tmp", "var/tmp", "cache"), 0o1777)}
+"""Empty folders by their modes. A new volume at /cache takes over the mode, so that the server may write to it."""
 
 
 def copy(root: Path, file: Path) -> None:
@@ -75,6 +76,13 @@ def opened() -> Iterator[Path]:
         yield Path(found[0])
 
 
+def make_empty(root: Path) -> None:
+    """Make the folders of `EMPTY`."""
+    for name, mode in EMPTY.items():
+        (root / name).mkdir(parents=True, exist_ok=True)
+        (root / name).chmod(mode)
+
+
 def main(root: Path, environment: Path) -> None:
     library = Path(sysconfig.get_path("stdlib"))
     ignored = shutil.ignore_patterns(*LEFT_OUT)
@@ -95,9 +103,7 @@ def main(root: Path, environment: Path) -> None:
     for name in SETTINGS:
         if Path("/", name).exists():
             copy(root, Path("/", name))
-    for name in EMPTY:
-        (root / name).mkdir(parents=True, exist_ok=True)
-        (root / name).chmod(0o1777 if name.endswith("tmp") else 0o755)
+    make_empty(root)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 Compiled code runs without the interpreter's lock, follows NumPy's rules for division by zero, and is stored on disk: in
 NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would reuse
 cached code as long as the file of the function is unchanged; here it is reused only as long as no module with compiled
-code has changed, nor, of a function outside the server, any module beside it. A cache in a read-only folder, as in a
-container, is still read.
+code has changed, nor, of a function outside the server, any module beside it. A cache beside the source in a read-only
+folder, as an image has it, is still read, also where NUMBA_CACHE_DIR is set and does not have the function yet.
 """
 
 import contextlib
@@ -23,7 +23,13 @@ import server.kernels.lean_numba  # noqa: F401
 # isort: split
 import llvmlite.binding
 from numba.core import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator, _CacheLocator
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserWideCacheLocator,
+    _CacheLocator,
+)
 from numba.core.environment import Environment
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
@@ -70,7 +76,8 @@ def _compile(function: Function, **more: Any) -> Function:
 def is_kept(function: Callable[..., Any]) -> bool:
     """Whether the code of a compiled function for this processor is already on disk."""
     processor = cpu_target.target_context.codegen().magic_tuple()
-    return any(key[1] == processor for key in function._cache._cache_file._load_index())  # type: ignore[attr-defined]
+    kept: _Cache = function._cache  # type: ignore[attr-defined]
+    return any(key[1] == processor for file in kept.files for key in file._load_index())
 
 
 def functions_compiled() -> int:
@@ -141,8 +148,13 @@ class _Locator(_CacheLocator):  # type: ignore[misc]
         self._line = function.__code__.co_firstlineno
         self._file = Path(file)
         beside = Path(file).parent / "__pycache__"
+        self.read_only_folder: Path | None = None
+        """A folder that is read as well, and never written to."""
         if "NUMBA_CACHE_DIR" in os.environ:
             self._folder = Path(os.environ["NUMBA_CACHE_DIR"]) / "nafir" / beside.parent.name
+            # One that can be written to is another's: whoever works on the code chooses a folder to begin anew.
+            if not _is_writable(beside):
+                self.read_only_folder = beside
         elif _is_writable(beside) or any(beside.glob("*.nbi")):
             self._folder = beside
         else:
@@ -195,19 +207,27 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        self.files = [self._cache_file]
+        """Where code may be kept, first the one that is written to."""
+        stamp = self._impl.locator.get_source_stamp()
+        if (folder := self._impl.locator.read_only_folder) is not None:
+            self.files.append(IndexDataCacheFile(str(folder), self._impl.filename_base, stamp))
         # The version is compared before anything is unpickled: code from other sources may refer to modules that no
         # longer exist.
-        self._cache_file._version = f"{self._cache_file._version} {self._impl.locator.get_source_stamp()}"
+        for file in self.files:
+            file._version = f"{file._version} {stamp}"
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """As in numba, but without the rules of typing and lowering. Setting them up takes a third of a second, and
         only compiling needs them, which then sets them up itself."""
         rtsys.initialize(target)  # sets up the memory allocation of compiled code
         with self._guard_against_spurious_io_errors():
-            loaded = self._load_overload(signature, target)
-        if loaded is None:
-            _look_for_no_blas()
-        return loaded
+            key = self._index_key(signature, target.codegen())
+            for file in self.files:
+                if (kept := file.load(key)) is not None:
+                    return self._impl.rebuild(target, kept)
+        _look_for_no_blas()
+        return None
 
     @classmethod
     def count(cls) -> None:

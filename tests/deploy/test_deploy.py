@@ -4,6 +4,7 @@ read these files are installed, they read them too."""
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -36,6 +37,10 @@ def manifest(kind):
 def compose():
     (found,) = documents(DEPLOY / "compose.yaml")
     return found
+
+
+def server_of_compose():
+    return compose()["services"]["server"]
 
 
 def container():
@@ -80,11 +85,52 @@ def test_every_setting_exists_and_takes_its_value(name, monkeypatch):
 def test_keys_that_are_made_later_are_seen():
     """`nafir keys` replaces its file. Where that alone is mounted, the old one stays."""
     folder = str(Path(of_compose()["NAFIR_KEYS_FILE"]).parent)
-    mounted = [each.split(":")[1] for each in compose()["services"]["server"]["volumes"]]
+    mounted = [each.split(":")[1] for each in server_of_compose()["volumes"]]
     assert folder in mounted
     (at,) = [each for each in container()["volumeMounts"] if each["name"] == "keys"]
     assert at["mountPath"] == str(Path(of_kubernetes()["NAFIR_KEYS_FILE"]).parent)
     assert "subPath" not in at
+
+
+def image_variables():
+    """What the image sets."""
+    return dict(re.findall(r"^\s*(?:ENV )?(\w+)=(\S+)(?: \\)?$", (ROOT / "Dockerfile").read_text(), re.MULTILINE))
+
+
+def test_what_is_compiled_is_kept_where_it_can_be_written():
+    """All roots are read-only."""
+    folder = image_variables()["NUMBA_CACHE_DIR"]
+    names = {target: source for source, target in (each.split(":")[:2] for each in server_of_compose()["volumes"])}
+    assert names[folder] in compose()["volumes"]
+    (at,) = [each for each in container()["volumeMounts"] if each["mountPath"] == folder]
+    pod = manifest("Deployment")["spec"]["template"]["spec"]
+    (volume,) = [each for each in pod["volumes"] if each["name"] == at["name"]]
+    assert "emptyDir" in volume
+    assert not at.get("readOnly")
+    assert pod["securityContext"]["fsGroup"] == pod["securityContext"]["runAsGroup"]
+    (managed,) = re.findall(r"^CacheDirectory=(\w+)$", UNIT.read_text(), re.MULTILINE)
+    assert of_systemd()["NUMBA_CACHE_DIR"] == f"/var/cache/{managed}"
+    assert not {"NUMBA_CACHE_DIR"} & (set(of_compose()) | set(of_kubernetes()))  # the image's holds
+
+
+def test_a_new_volume_for_what_is_compiled_can_be_written_by_any_user(tmp_path):
+    """It takes over the owner and mode of the folder that the image has in its place."""
+    folder = image_variables()["NUMBA_CACHE_DIR"].removeprefix("/")
+    script = runpy.run_path(str(DEPLOY / "container" / "root.py"))
+    script["make_empty"](tmp_path)
+    assert (tmp_path / folder).stat().st_mode & 0o7777 == 0o1777
+    assert list((tmp_path / folder).iterdir()) == []
+
+
+def test_the_test_of_the_image_runs_the_server_as_compose_does():
+    ran = (ROOT / "tests" / "integration" / "container.sh").read_text()
+    ran = ran[ran.index("# As deploy/compose.yaml runs it") :]
+    told = dict(re.findall(r"--env \"?(\w+)=([^\s\"]+)", ran))
+    assert of_compose().items() - {("NAFIR_ALLOWED_HOSTS", "word,server")} <= told.items()
+    mounted = {tuple(each.split(":")[1:]) for each in server_of_compose()["volumes"]}
+    assert mounted <= {tuple(each.split(":")) for each in re.findall(r"--volume \"?[^\s:]+:([^\s\"]+)", ran)}
+    assert f"--user {server_of_compose()['user']}" in ran
+    assert all(f"--tmpfs {each}" in ran for each in server_of_compose()["tmpfs"])
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@
 # Debian with its Python 3.13 (the 3.11 of the release before is too old for requirements.lock), in an image store of this
 # script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
 # for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
-# through the scene over WebSocket. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy, and a client listens
-# through wss.
+# through the scene over WebSocket. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy: a key made meanwhile
+# opens it, and a client listens through wss. Neither start compiles anything.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback; TLS_PORT=8443 that of Caddy, if it is installed
@@ -117,6 +117,8 @@ start_server() {
         sleep 0.5
     done
     echo "ready in $((SECONDS - started)) s"
+    ! run_podman logs "$container" 2>&1 | grep --quiet "compiling for this processor" ||
+        fail "it compiles what the image should hold"
 }
 stop_server() {
     say "stopping it"
@@ -134,12 +136,16 @@ start_server
 run_podman exec "$container" python -c '
 import importlib.util, os
 assert os.getuid() != 0, "runs as root"
+folders = [*os.environ["PATH"].split(":"), "/bin", "/sbin", "/usr/sbin", "/usr/local/sbin"]
+for shell in ("sh", "bash", "dash", "ash", "busybox"):
+    found = [folder for folder in folders if os.path.lexists(f"{folder}/{shell}")]
+    assert not found, f"{shell} is in {found}"
 for module in ("torch", "training", "pip"):
     assert importlib.util.find_spec(module) is None, f"{module} is in the image"
 try:
     open("/opt/nafir/probe", "w")
 except OSError:
-    print("uid", os.getuid(), "- read-only root, no torch, no training side")
+    print("uid", os.getuid(), "- read-only root, no shell, no torch, no training side")
 else:
     raise SystemExit("the root file system is writable")
 '
@@ -180,19 +186,19 @@ run_podman exec "$container" python /dev/shm/walk.py --url "ws://127.0.0.1:$port
 
 stop_server
 
-# As deploy/compose.yaml runs it: keys, a folder for the cache, and Caddy with TLS in front. The networks of compose take a
-# plug-in and rights that such a machine often has not, so both stand on the host's; Caddy is the host's program.
+# As deploy/compose.yaml runs it: a folder of keys, a new volume for the cache, and Caddy with TLS in front. The networks of
+# compose take a plug-in and rights that such a machine often has not, so both stand on the host's; Caddy is the host's program.
 if command -v caddy >/dev/null; then
     say "running it behind TLS, with keys"
-    mkdir -p "$state/secrets" "$state/cache"
-    rm -f "$state/secrets/keys.json"
-    nafir_keys() { run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$state/secrets:/secrets" --user 0 "$image" keys "$@"; }
-    key=$(nafir_keys create --file /secrets/keys.json --scope listen --scope render)
-    metrics_key=$(nafir_keys create --file /secrets/keys.json --scope metrics)
-    chmod 644 "$state/secrets/keys.json"
-    chmod 777 "$state/cache"
-    start_server --tmpfs /tmp --user 10001:10001 --volume "$state/cache:/cache" --env NUMBA_CACHE_DIR=/cache \
-        --volume "$state/secrets/keys.json:/run/secrets/keys:ro" --env NAFIR_KEYS_FILE=/run/secrets/keys \
+    secrets=$state/secrets/keys
+    mkdir -p "$secrets"
+    rm -f "$secrets/keys.json"
+    run_podman volume rm --force nafir-cache >/dev/null
+    nafir_keys() { run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$secrets:/keys" --user 0 "$image" keys "$@"; }
+    metrics_key=$(nafir_keys create --file /keys/keys.json --scope metrics)
+    chmod 644 "$secrets/keys.json"
+    start_server --tmpfs /tmp --user 10001:10001 --volume nafir-cache:/cache \
+        --volume "$secrets:/keys:ro" --env NAFIR_KEYS_FILE=/keys/keys.json \
         --env NAFIR_REQUIRE_AUTH=true --env NAFIR_ALLOWED_HOSTS=localhost --env NAFIR_DRAIN_S=8 \
         --env NAFIR_MAX_CONNECTIONS_PER_ADDRESS=1024
     tls=https://localhost:$tls_port
@@ -205,12 +211,17 @@ if command -v caddy >/dev/null; then
         ((SECONDS - started < 180)) || { tail -5 "$state/caddy.log"; fail "not ready behind TLS after 180 s"; }
         sleep 0.5
     done
+    run_podman exec "$container" python -c 'open("/cache/probe", "w")' || fail "nothing can be kept in /cache"
+    key=$(nafir_keys create --file /keys/keys.json --scope listen --scope render)
     status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
     [ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
-    [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ] || fail "a key opens nothing"
+    made=$SECONDS
+    until [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ]; do
+        ((SECONDS - made < 20)) || fail "a key made while the server runs opens nothing after 20 s"
+        sleep 0.5
+    done
     [ "$(status -H "Authorization: Bearer $metrics_key" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
     [ "$(status -H "Authorization: Bearer $metrics_key" "$url/metrics")" = 200 ] || fail "Prometheus' key opens no metrics"
-    run_podman exec --interactive "$container" sh -c true 2>/dev/null && fail "the image has a shell"
     tar --create --directory "$root/client_examples/python" nafir_client --directory "$(dirname "$authority")" root.crt |
         run_podman exec --interactive "$container" python -c "$unpack"
     run_podman exec --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/dev/shm/root.crt --workdir /dev/shm "$container" python -c \

@@ -163,6 +163,31 @@ def test_where_nothing_can_be_written_what_is_there_is_read(package):
     assert not list(package.glob("**/*.nbc"))
 
 
+def test_a_new_folder_is_filled_up_from_what_cannot_be_written_to(package, tmp_path_factory):
+    """As the volume of a container whose image holds compiled code: only what that lacks is compiled and kept."""
+    assert run(package) == (20, 0)
+    folder = tmp_path_factory.mktemp("cache")
+    check = (
+        "import server.kernels.compiled as c; is_writable = c._is_writable; "
+        "c._is_writable = lambda folder: folder.name != '__pycache__' and is_writable(folder); "
+        "import server.outer as o; "
+        "print(c.is_kept(o.outer), o.outer(1), o.outer(1.5), sum(o.outer.stats.cache_hits.values()))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(folder)}
+
+    def told():
+        command = [sys.executable, "-c", check]
+        return subprocess.run(command, cwd=package, env=environment, check=True, capture_output=True, text=True).stdout
+
+    assert told() == "True 20 25.0 1\n"
+    assert len(list(folder.glob("**/*.nbc"))) == 1
+    assert told() == "True 20 25.0 2\n"
+    for path in package.glob("**/*.nb?"):
+        path.unlink()
+    assert told() == "True 20 25.0 1\n"  # the index of the folder has one
+    assert told() == "True 20 25.0 2\n"
+
+
 def test_scipys_linear_algebra_is_not_imported_and_can_be(tmp_path):
     """It takes as long as a third of all else before the first block. Whoever multiplies matrices finds it."""
     (tmp_path / "product.py").write_text("import numba\n\n@numba.njit\ndef square(a):\n    return a @ a\n")
