@@ -135,6 +135,23 @@ def test_two_ears_hear_an_ambisonic_stream_and_turn_at_once(served_directional, 
     assert facing_south[1] > 1.1 * facing_south[0]
 
 
+def test_of_ambisonics_one_listener_has_ears_and_another_the_channels(served_directional):
+    with connect(served_directional, output="ambisonics", head="kemar") as stream:
+        left, raw = stream.add_listener((4.0, 2.5, 1.5), yaw=np.pi / 2, head="kemar"), stream.add_listener()
+        assert (stream.channels, left.channels, raw.channels) == (2, 2, 4)
+        with pytest.raises(ValueError, match="output_rate: a head hears the stream's own rate"):
+            stream.add_listener(head="kemar", output_rate=48_000)
+        # To the left of one who looks north, and to the right of one who looks south.
+        stream.add_emitter(clip="woman-reading", position=(1.0, 2.5, 1.5))
+        facing_north = played(left, 1.0)
+        left.move((4.0, 2.5, 1.5), yaw=-np.pi / 2)
+        facing_south = played(left, 1.0)[1_000:]
+        assert played(raw, 0.3).any()
+    north, south = (np.sqrt(np.mean(sound**2, axis=0)) for sound in (facing_north, facing_south))
+    assert north[0] > 1.1 * north[1]
+    assert south[1] > 1.1 * south[0]
+
+
 def test_a_head_for_another_output_is_refused(served):
     with pytest.raises(ValueError, match="head: belongs to the output ambisonics"), connect(served, head="kemar"):
         pass

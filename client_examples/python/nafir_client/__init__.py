@@ -20,8 +20,8 @@ from nafir_client.errors import (
 from nafir_client.pose import Pose
 from nafir_client.scene import Scene, Welcome
 from nafir_client.session import Message, StreamOptions
-from nafir_client.stream import Emitter, Stream, connect
-from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.stream import Emitter, Listener, Stream, connect
+from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
 from nafir_client.wire import EFFECTS, Block
 
 __all__ = [
@@ -36,6 +36,8 @@ __all__ = [
     "Emitter",
     "ImpulseResponse",
     "ImpulseResponses",
+    "Listener",
+    "ListenerStatistics",
     "Message",
     "MissingExtraError",
     "MissingLibraryError",

@@ -15,8 +15,8 @@ class RefusedError(NafirClientError):
     """The server refused a message, a stream or a request.
 
     `code` is stable and machine-readable: the server's reference lists the codes. `field` names the input at fault, and
-    `emitter` the emitter that the refused message was about. `retry_after_s` says after how long it is worthwhile to
-    ask again, and `level` at which quality level the stream would be let in now.
+    `emitter` or `listener` who the refused message was about: a listener beside the first. `retry_after_s` says after
+    how long it is worthwhile to ask again, and `level` at which quality level the stream would be let in now.
     """
 
     def __init__(
@@ -26,6 +26,7 @@ class RefusedError(NafirClientError):
         *,
         field: str | None = None,
         emitter: str | None = None,
+        listener: str | None = None,
         retry_after_s: float | None = None,
         level: str | None = None,
     ) -> None:
@@ -34,6 +35,7 @@ class RefusedError(NafirClientError):
         self.message = message
         self.field = field
         self.emitter = emitter
+        self.listener = listener
         self.retry_after_s = retry_after_s
         self.level = level
 

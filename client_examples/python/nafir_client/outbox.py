@@ -7,19 +7,20 @@ something and are not poses. They are kept after they were sent, so that the oth
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
+Added = Literal["emitter", "listener"]
 _MOST_KEPT: Final = 1_000
 """Counted messages that are kept. A server that had not handled older ones had closed the connection."""
 
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message. `adds` is the id of the emitter that it adds, if it adds one."""
+    """A message. `adds` is what it adds, if it does: the kind and the id of an emitter or listener."""
 
     data: str | bytes
     is_counted: bool = False
-    adds: str | None = None
+    adds: tuple[Added, str] | None = None
 
 
 class Outbox:
@@ -53,8 +54,8 @@ class Outbox:
         return message.data
 
     @property
-    def adds(self) -> set[str]:
-        """Ids of emitters that waiting messages add."""
+    def adds(self) -> set[tuple[Added, str]]:
+        """Kinds and ids of what waiting messages add."""
         return {message.adds for message in self._waiting.values() if message.adds is not None}
 
     def begin(self) -> None:

@@ -4,15 +4,20 @@ from types import TracebackType
 from typing import Any, Self
 
 from nafir_client.errors import DeviceError, MissingExtraError
-from nafir_client.threaded import ThreadedStream
+from nafir_client.threaded import ThreadedListener, ThreadedStream
 
 
 class Player:
-    """Plays a stream in `with`. `device` is a name or number of sounddevice's, by default the system's; `latency` is
-    `low`, `high` or seconds. Raises MissingExtraError or DeviceError."""
+    """Plays what a stream's first listener hears, or another one, in `with`. `device` is a name or number of
+    sounddevice's, by default the system's; `latency` is `low`, `high` or seconds. Raises MissingExtraError or
+    DeviceError."""
 
     def __init__(
-        self, stream: ThreadedStream, *, device: str | int | None = None, latency: str | float = "low"
+        self,
+        stream: ThreadedStream | ThreadedListener,
+        *,
+        device: str | int | None = None,
+        latency: str | float = "low",
     ) -> None:
         try:
             import sounddevice

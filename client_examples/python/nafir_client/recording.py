@@ -59,12 +59,14 @@ class Recording:
 
 
 class PathAsHeard:
-    """From which sample on each pose and each quality level was heard.
+    """From which sample on each pose and each quality level was heard by the first listener of a stream, or by the one
+    with the id `listener`.
 
     `nafir render --path` makes the same sound from the file that `write` makes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, listener: str | None = None) -> None:
+        self._listener = listener
         self._poses: dict[int, Pose] = {}
         self._levels: dict[int, str] = {}
         """Quality level by its first sample, of those that were not the first."""
@@ -75,7 +77,7 @@ class PathAsHeard:
         self._poses[pose_id] = pose
 
     def note_message(self, message: Message) -> None:
-        if message["type"] == "level_changed":
+        if message["type"] == "level_changed" and message.get("listener") == self._listener:
             self._levels[message["sample_clock"]] = message["level"]
 
     def note_block(self, block: Block) -> None:

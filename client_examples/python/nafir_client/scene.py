@@ -65,7 +65,8 @@ class Scene:
 
 @dataclass(frozen=True)
 class Welcome:
-    """What the server has agreed to for a stream. `window` is how many blocks may be unacknowledged."""
+    """What the server has agreed to for a stream. `window` is how many blocks of each listener may be
+    unacknowledged, and `max_listeners` how many listeners there may be, if that was asked."""
 
     scene: Scene
     sample_rate: int
@@ -78,6 +79,7 @@ class Welcome:
     hrtf: str
     level: str
     order: int | None
+    max_listeners: int | None
     given: Mapping[str, Any]
 
     @classmethod
@@ -96,6 +98,7 @@ class Welcome:
                 hrtf=given["hrtf"],
                 level=given["level"],
                 order=given.get("order"),
+                max_listeners=given.get("max_listeners"),
                 given=given,
             )
         except KeyError as exc:

@@ -1,6 +1,6 @@
 """The client's side of a stream, without input and output: messages in, messages and blocks out.
 
-A session outlives its connections. It knows what the stream should be (listener, emitters, level, effects), so that a
+A session outlives its connections. It knows what the stream should be (listeners, emitters, level, effects), so that a
 new connection can be made to be what the last one was. The clock goes on over connections: sample clocks are those of
 the session, not of the server.
 """
@@ -16,7 +16,7 @@ from nafir_client.opus import OpusReader, OpusWriter, require_opus
 from nafir_client.outbox import Outbox, Outgoing
 from nafir_client.pose import Orientation, Pose, Position
 from nafir_client.scene import Welcome
-from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
 from nafir_client.wire import (
     BLOCK_KIND,
     PROTOCOL,
@@ -26,6 +26,7 @@ from nafir_client.wire import (
     Samples,
     dry_bytes,
     dry_packet_bytes,
+    listener_of,
     parse_block,
     parse_packets,
     pose_bytes,
@@ -34,18 +35,22 @@ from nafir_client.wire import (
 Message = Mapping[str, Any]
 """A text message of the server. Its `type` says which fields it has."""
 _ACKNOWLEDGE_EVERY = 4
-_UNCOUNTED = frozenset({"move_emitter", "acknowledge", "ping"})
+_UNCOUNTED = frozenset({"listener", "move_emitter", "acknowledge", "ping"})
 _TOKEN_UNKNOWN = "unknown_resume_token"
 _REFUSALS_OF_FORM = frozenset({"malformed_message", "malformed_pose", "malformed_directivity", "message_too_large"})
-"""Errors about messages that the server could not read, so that it cannot say which emitter they were about."""
+"""Errors about messages that the server could not read, so that it cannot say which emitter or listener they were
+about."""
+_NOT_KNOWN = "unknown_message"
+"""The error of a server that is too old to have several listeners in a stream."""
 
 
 class StreamOptions(TypedDict, total=False):
     """What may be said of a stream when it is opened; the server's reference has the meaning of each.
 
-    `listener` is the pose with which it begins. `emitters` is how many emitters are to come. `level` is a quality level
-    or `auto`. `opus` says how the encoding `opus` encodes. `order` is that of the output `ambisonics`. `effects`
-    switches effects on or off.
+    `listener` is the pose with which it begins. `emitters` is how many emitters are to come, and `listeners` how many
+    listeners there will be, the first one included: the server keeps room for them. `level` is a quality level or
+    `auto`. `opus` says how the encoding `opus` encodes. `order` is that of the output `ambisonics`. `effects` switches
+    effects on or off.
     """
 
     sample_rate: int
@@ -59,6 +64,7 @@ class StreamOptions(TypedDict, total=False):
     level: str
     effects: Mapping[str, bool]
     emitters: int
+    listeners: int
     listener: Pose
 
 
@@ -113,6 +119,32 @@ class SessionEmitter:
         return "clip" in self.fields and not self.fields.get("loop", True)
 
 
+class SessionListener:
+    """A listener beside the first, as it should be. `hrtf` names its head; None for that of the stream."""
+
+    def __init__(self, identifier: str, pose: Pose, hrtf: str | None) -> None:
+        self.id = identifier
+        self.pose = pose
+        self.hrtf = hrtf
+        self.pose_id = 0
+        """That of its newest move."""
+        self.index: int | None = None
+        """Its number in the blocks of the present connection; None until the server has said it."""
+        self.start_clock = 0
+        """The clock of its first block in the present stream of the server's, or in the last one."""
+        self.level = ""
+        """The present quality level."""
+        self.statistics = ListenerStatistics()
+        self.next_clock = 0
+        """The clock of the frame after its newest block."""
+        self.packets: OpusReader | None = None
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the server of the present connection has said that it is there."""
+        return self.index is not None
+
+
 class Session:
     """The state of one stream. Every method that has something to send puts it into `outbox`. Raises
     MissingLibraryError for a stream in Opus where there is no libopus."""
@@ -125,6 +157,8 @@ class Session:
         self._hello = {"type": "hello", "protocol": PROTOCOL, "scene": scene, **given}
         self.outbox = Outbox()
         self.emitters: dict[str, SessionEmitter] = {}
+        self.listeners: dict[str, SessionListener] = {}
+        """Those beside the first."""
         self.statistics = StreamStatistics()
         self.welcome: Welcome | None = None
         self.level = ""
@@ -139,7 +173,7 @@ class Session:
         self._listener_pose_id = 0
         self._resume_token: str | None = None
         self._last_block: tuple[int, int] | None = None
-        """The number and the server's clock of the newest block."""
+        """The greatest number and the greatest of the server's clocks of all blocks, whoever's they are."""
         self._packets: OpusReader | None = None
         self._restored: list[SessionEmitter] = []
         """What a new stream is to have of the last one."""
@@ -163,13 +197,17 @@ class Session:
                 emitter.has_ended = True  # what plays once is not played again
                 del self.emitters[emitter.id]
             emitter.is_heard = False
+        for listener in self.listeners.values():
+            listener.index = None
         self._restored = list(self.emitters.values())
         self._last_block = None
         hello = dict(self._hello)
         if self.listener is not None:
-            hello["listener"] = {"position": self.listener.position, "orientation": self.listener.orientation}
+            hello["listener"] = _pose_fields(self.listener)
         if self.emitters:
             hello["emitters"] = max(hello.get("emitters", 0), len(self.emitters))
+        if self.listeners:
+            hello["listeners"] = max(hello.get("listeners", 0), 1 + len(self.listeners))
         return json.dumps(hello)
 
     def greet(self, data: str | bytes, now_s: float) -> Welcome:
@@ -190,11 +228,13 @@ class Session:
         resumed = answer.get("resumed")
         if resumed is not None:
             self._resume(resumed["pose_id"], resumed["handled"], resumed["sample_clock"], now_s)
+            self._resume_listeners(resumed, now_s)
         else:
             if not is_first:
                 self._clock_offset = self._continued(self.welcome, now_s)
             self._packets = _packet_reader(self.welcome)
-            self.outbox.put_first([self._added(emitter) for emitter in self._restored])
+            listeners = [self._added_listener(listener) for listener in self.listeners.values()]
+            self.outbox.put_first(listeners + [self._added(emitter) for emitter in self._restored])
         return self.welcome
 
     def _resume(self, pose_id: int, handled: int, sample_clock: int, now_s: float) -> None:
@@ -206,16 +246,35 @@ class Session:
             if emitter.pose_id > pose_id:
                 orientation = emitter.fields.get("orientation")
                 self.move_emitter(emitter, emitter.fields["position"], orientation, now_s)
-            if not emitter.is_heard and emitter.id not in self.outbox.adds:
+            if not emitter.is_heard and ("emitter", emitter.id) not in self.outbox.adds:
                 # It is there, and that it is heard may have been said just before the connection was lost.
                 emitter.is_heard, emitter.start_clock = True, sample_clock + self._clock_offset
             if emitter.live and emitter.is_heard:
                 emitter.live.open()
 
+    def _resume_listeners(self, resumed: Mapping[str, Any], now_s: float) -> None:
+        """Listeners that the server has go on. Those that it should have and has not are asked for again."""
+        there = {each["id"]: each["index"] for each in resumed.get("listeners", ())}
+        for listener in self.listeners.values():
+            if ("listener", listener.id) in self.outbox.adds:
+                continue  # if the server has one of this id, it is to remove that first
+            index = there.get(listener.id)
+            if index is None and listener.is_there:
+                listener.index = None  # it cannot be there any more, and an error will say why
+            elif index is None:
+                self.outbox.put(self._added_listener(listener))
+            else:
+                if not listener.is_there:  # that it was added may have been said just before the connection was lost
+                    self._begin_listener(listener, index, resumed["sample_clock"] + self._clock_offset)
+                listener.level = self.level
+                if listener.pose_id > resumed["pose_id"]:
+                    self.move_added_listener(listener, listener.pose, now_s)
+
     def disconnect(self) -> None:
         """The connection is lost, and what was on its way."""
-        self.statistics.pose_to_sound.forget()
-        self.statistics.pose_to_reverberation.forget()
+        for counts in (self.statistics, *(listener.statistics for listener in self.listeners.values())):
+            counts.pose_to_sound.forget()
+            counts.pose_to_reverberation.forget()
         for emitter in self.emitters.values():
             if emitter.live:
                 emitter.live.close()
@@ -246,9 +305,43 @@ class Session:
     def move_listener(self, pose: Pose, now_s: float) -> int:
         """Returns the pose id, which blocks name once they are heard from there."""
         self.listener = pose
-        self._listener_pose_id = pose_id = self._new_pose(now_s)
+        self._listener_pose_id = pose_id = self._new_pose(self.statistics, now_s)
         self.outbox.put(Outgoing(pose_bytes(pose, pose_id)), "listener")
         return pose_id
+
+    def add_listener(self, identifier: str, pose: Pose, hrtf: str | None) -> SessionListener:
+        """Raises RefusedError duplicate_listener."""
+        if identifier in self.listeners:
+            problem = f"listener {identifier!r} is already there"
+            raise RefusedError("duplicate_listener", problem, field="id", listener=identifier)
+        listener = self.listeners[identifier] = SessionListener(identifier, pose, hrtf)
+        self.outbox.put(self._added_listener(listener))
+        return listener
+
+    def move_added_listener(self, listener: SessionListener, pose: Pose, now_s: float) -> int:
+        """Returns the pose id, which blocks of this listener name once they are heard from there. Raises RefusedError
+        unknown_listener for one that was removed or refused."""
+        if self.listeners.get(listener.id) is not listener:
+            problem = f"listener {listener.id!r} is not there any more"
+            raise RefusedError("unknown_listener", problem, field="listener", listener=listener.id)
+        listener.pose = pose
+        listener.pose_id = pose_id = self._new_pose(listener.statistics, now_s)
+        key = "listener", listener.id
+        if listener.index is None:  # a new connection has asked for it, but does not know its number yet
+            moved = {"pose_id": pose_id, "listener": listener.id, **_pose_fields(pose)}
+            self._put({"type": "listener", **moved}, key)
+        else:
+            self.outbox.put(Outgoing(pose_bytes(pose, pose_id, listener.index)), key)
+        return pose_id
+
+    def remove_listener(self, listener: SessionListener) -> None:
+        if self.listeners.get(listener.id) is listener:
+            del self.listeners[listener.id]
+            self._put({"type": "remove_listener", "id": listener.id})
+
+    def forget_listener(self, listener: SessionListener) -> None:
+        """The server has refused it."""
+        self.listeners.pop(listener.id, None)
 
     def add_emitter(self, fields: dict[str, Any], live: LiveInput | None) -> SessionEmitter:
         """Raises RefusedError duplicate_emitter."""
@@ -267,7 +360,7 @@ class Session:
             emitter.fields.pop("yaw", None)
             moved["orientation"] = orientation
         emitter.fields.update(moved)
-        emitter.pose_id = pose_id = self._new_pose(now_s)
+        emitter.pose_id = pose_id = self._new_pose(self.statistics, now_s)
         self._put({"type": "move_emitter", "id": emitter.id, "pose_id": pose_id, **moved}, ("move", emitter.id))
         return pose_id
 
@@ -330,41 +423,84 @@ class Session:
         for name in ("start_at", "stop_at"):
             if name in fields:
                 fields[name] = max(0, fields[name] - self._clock_offset)
-        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True, adds=emitter.id)
+        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True, adds=("emitter", emitter.id))
+
+    def _added_listener(self, listener: SessionListener) -> Outgoing:
+        """What adds a listener where it is by now."""
+        fields = {"id": listener.id, **_pose_fields(listener.pose)}
+        if listener.hrtf is not None:
+            fields["hrtf"] = listener.hrtf
+        added = json.dumps({"type": "add_listener", **fields})
+        return Outgoing(added, is_counted=True, adds=("listener", listener.id))
+
+    def _begin_listener(self, listener: SessionListener, index: int, clock: int) -> None:
+        """The server has said that a listener is there, from this clock of the session's on."""
+        assert self.welcome is not None
+        listener.index, listener.start_clock = index, clock
+        if not listener.statistics.blocks:
+            listener.next_clock = clock
+        listener.level = self.level
+        listener.packets = _packet_reader(self.welcome)
 
     def _put(self, message: Mapping[str, Any], key: object = None) -> None:
         self.outbox.put(Outgoing(json.dumps(message), is_counted=message["type"] not in _UNCOUNTED), key)
 
-    def _new_pose(self, now_s: float) -> int:
+    def _new_pose(self, counts: ListenerStatistics, now_s: float) -> int:
         pose_id, self._next_pose_id = self._next_pose_id, self._next_pose_id + 1
-        self.statistics.pose_to_sound.send(pose_id, now_s)
-        self.statistics.pose_to_reverberation.send(pose_id, now_s)
+        counts.pose_to_sound.send(pose_id, now_s)
+        counts.pose_to_reverberation.send(pose_id, now_s)
         return pose_id
 
-    def _receive_block(self, data: bytes, now_s: float) -> Block:
-        welcome, counts = self.welcome, self.statistics
-        assert welcome is not None
-        if self._packets is None:
-            block = parse_block(data, welcome.encoding, now_s, self._clock_offset)
-        else:
-            block = parse_packets(data, self._packets, now_s, self._clock_offset)
+    def _receive_block(self, data: bytes, now_s: float) -> Block | None:
+        """Take a block of any listener. Returns None for that of a listener which was removed meanwhile."""
+        index = listener_of(data)
+        if index:
+            listener = self.listener_at(index)
+            if listener is None:
+                return None
+            block = self._counted(data, listener.packets, listener.statistics, listener.next_clock, now_s)
+            listener.next_clock = block.sample_clock + block.frames
+            self._acknowledge(block, listener.id)
+            return block
+        block = self._counted(data, self._packets, self.statistics, self.next_clock, now_s)
         frames = block.sample_clock + block.frames - self.next_clock
-        counts.blocks += 1
-        counts.blocks_late += block.is_late
-        counts.blocks_limited += block.is_limited
-        counts.blocks_skipped += max(0, block.sample_clock - self.next_clock) // welcome.block_size
-        counts.pose_to_sound.receive(block.pose_id, now_s)
-        counts.pose_to_reverberation.receive(block.reverberation_pose_id, now_s)
         self.next_clock = block.sample_clock + block.frames
-        self._last_block = block.sequence, block.sample_clock - self._clock_offset
         self._arrived_s = now_s
-        if block.sequence % _ACKNOWLEDGE_EVERY == _ACKNOWLEDGE_EVERY - 1:
-            self._put({"type": "acknowledge", "sequence": block.sequence}, "acknowledge")
+        self._acknowledge(block, None)
         for emitter in self.emitters.values():
             if emitter.live:
                 emitter.live.advance(frames)
         self.pump()
         return block
+
+    def listener_at(self, index: int) -> SessionListener | None:
+        """The listener beside the first that has this number in the present connection."""
+        return next((listener for listener in self.listeners.values() if listener.index == index), None)
+
+    def _counted(
+        self, data: bytes, packets: OpusReader | None, counts: ListenerStatistics, next_clock: int, now_s: float
+    ) -> Block:
+        """Read a block of a listener for whom one of `next_clock` was due, and count it."""
+        welcome = self.welcome
+        assert welcome is not None
+        if packets is None:
+            block = parse_block(data, welcome.encoding, now_s, self._clock_offset)
+        else:
+            block = parse_packets(data, packets, now_s, self._clock_offset)
+        counts.blocks += 1
+        counts.blocks_late += block.is_late
+        counts.blocks_limited += block.is_limited
+        counts.blocks_skipped += max(0, block.sample_clock - next_clock) // welcome.block_size
+        counts.pose_to_sound.receive(block.pose_id, now_s)
+        counts.pose_to_reverberation.receive(block.reverberation_pose_id, now_s)
+        sequence, clock = self._last_block or (0, 0)
+        self._last_block = max(sequence, block.sequence), max(clock, block.sample_clock - self._clock_offset)
+        return block
+
+    def _acknowledge(self, block: Block, listener: str | None) -> None:
+        if block.sequence % _ACKNOWLEDGE_EVERY == _ACKNOWLEDGE_EVERY - 1:
+            whose = {} if listener is None else {"listener": listener}
+            self._put({"type": "acknowledge", "sequence": block.sequence, **whose}, ("acknowledge", listener))
 
     def _continued(self, welcome: Welcome, now_s: float) -> int:
         """The clock at which a new stream of the server's begins: as much later as the connection was away. The last
@@ -388,6 +524,13 @@ class Session:
                 emitter.has_ended = True
                 if message.get("removed"):
                     del self.emitters[identifier]
+            case {"type": "listener_added", "id": identifier, "index": index, "sample_clock": clock} if (
+                identifier in self.listeners
+            ):
+                self._begin_listener(self.listeners[identifier], index, clock)
+            case {"type": "level_changed", "level": level, "listener": identifier}:
+                if identifier in self.listeners:
+                    self.listeners[identifier].level = level
             case {"type": "level_changed", "level": level}:
                 self.level = level
             case {"type": "status", "live": live}:
@@ -413,6 +556,19 @@ class Session:
             return None
         return next((each for each in self.emitters.values() if not each.is_heard), None)
 
+    def refused_listener(self, error: RefusedError) -> SessionListener | None:
+        """The listener that was not added because of an error; None if the error was about something else."""
+        if error.listener is not None:
+            listener = self.listeners.get(error.listener)
+            return None if listener is None or listener.is_there else listener
+        if error.code not in _REFUSALS_OF_FORM | {_NOT_KNOWN}:
+            return None
+        return next((each for each in self.listeners.values() if not each.is_there), None)
+
+
+def _pose_fields(pose: Pose) -> dict[str, Any]:
+    return {"position": pose.position, "orientation": pose.orientation}
+
 
 def _packet_reader(welcome: Welcome) -> OpusReader | None:
     """What decodes a stream in Opus; None for one of single samples."""
@@ -424,7 +580,7 @@ def _packet_reader(welcome: Welcome) -> OpusReader | None:
 
 def refusal(message: Message) -> RefusedError:
     """The error that a message tells of."""
-    names = "field", "emitter", "retry_after_s", "level"
+    names = "field", "emitter", "listener", "retry_after_s", "level"
     return RefusedError(
         str(message.get("code", "")), str(message.get("message", "")), **{name: message.get(name) for name in names}
     )

@@ -1,8 +1,11 @@
 """A stream in asyncio: `async with connect(URL, scene=...) as stream`.
 
 One task reads from the socket and makes the connection anew when it is lost; another writes. What a stream has to say
-waits in the outbox of its session, where newer poses take the place of older ones. Blocks wait to be taken; if they are
-not, the oldest are dropped and counted.
+waits in the outbox of its session, where newer poses take the place of older ones. Blocks of each listener wait to be
+taken; if they are not, the oldest are dropped and counted.
+
+A stream is its first listener: iterating it takes that one's blocks. `Stream.add_listener` adds others, who hear the
+same emitters at the same clock.
 """
 
 import asyncio
@@ -10,8 +13,7 @@ import contextlib
 import itertools
 import random
 import time
-from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Container, Iterable, Mapping
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar, Unpack
 
@@ -22,6 +24,7 @@ from websockets.asyncio.client import connect as connect_socket
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from nafir_client.address import stream_url
+from nafir_client.arrivals import Arrivals
 from nafir_client.backoff import Backoff
 from nafir_client.client import refused
 from nafir_client.errors import (
@@ -34,8 +37,16 @@ from nafir_client.errors import (
 from nafir_client.live_input import LiveInput
 from nafir_client.pose import Pose, Position
 from nafir_client.scene import Scene, Welcome
-from nafir_client.session import EmitterOptions, Message, Session, SessionEmitter, StreamOptions, refusal
-from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.session import (
+    EmitterOptions,
+    Message,
+    Session,
+    SessionEmitter,
+    SessionListener,
+    StreamOptions,
+    refusal,
+)
+from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
 from nafir_client.wire import Block
 
 T = TypeVar("T")
@@ -153,8 +164,72 @@ class Emitter:
         self._stream.offer(self._state, samples)
 
 
+class Listener:
+    """A listener of a stream beside its first. `Stream.add_listener` makes it. Iterating takes its blocks, until it is
+    removed; a NafirClientError says that it cannot be there any more, though the stream may go on."""
+
+    def __init__(self, stream: "Stream", state: SessionListener, arrivals: Arrivals) -> None:
+        self._stream = stream
+        self._state = state
+        self._arrivals = arrivals
+
+    @property
+    def id(self) -> str:
+        return self._state.id
+
+    @property
+    def pose(self) -> Pose:
+        """Its newest pose."""
+        return self._state.pose
+
+    @property
+    def start_clock(self) -> int:
+        """The clock of its first block, in the present connection."""
+        return self._state.start_clock
+
+    @property
+    def sample_clock(self) -> int:
+        """The clock of the frame after its newest block."""
+        return self._state.next_clock
+
+    @property
+    def level(self) -> str:
+        """Its present quality level, which under load may be another than that of others."""
+        return self._state.level
+
+    @property
+    def statistics(self) -> ListenerStatistics:
+        return self._state.statistics
+
+    @property
+    def failure(self) -> NafirClientError | None:
+        """Why no more blocks of it will come: ClosedError after it was removed; None while it is there."""
+        return self._arrivals.failure
+
+    def __aiter__(self) -> AsyncIterator[Block]:
+        return self
+
+    async def __anext__(self) -> Block:
+        """Its oldest block that has not been taken. Raises RefusedError if a new connection may not have it again, or
+        another NafirClientError if the stream has ended."""
+        return await self._arrivals.take()
+
+    async def move(
+        self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
+    ) -> int:
+        """Move it: metres, and a yaw in radians or a quaternion. Returns the pose's id, which its blocks name once it
+        hears from there. Raises ValueError for numbers that are no pose, and `failure` if it is not there any more."""
+        return await self._stream.move_added_listener(
+            self._state, Pose.of(position, yaw=yaw, orientation=orientation), self._arrivals
+        )
+
+    async def remove(self) -> None:
+        """Take it out of the stream. Its blocks that have arrived can still be taken."""
+        await self._stream.remove_listener(self._state, self._arrivals)
+
+
 class Stream:
-    """One listener in one scene, for as long as it is open. Iterating takes its blocks."""
+    """One scene and its first listener, for as long as it is open. Iterating takes the first listener's blocks."""
 
     def __init__(
         self,
@@ -173,16 +248,19 @@ class Stream:
         self._backoff = reconnect
         self.patience_s = patience_s
         self._on_message = on_message
-        self._blocks: deque[Block] = deque()
-        self._has_news = asyncio.Event()
+        self._arrivals = Arrivals()
+        self._arrivals_of: dict[str, Arrivals] = {}
+        """By the ids of listeners beside the first."""
         self._has_outgoing = asyncio.Event()
         self._has_room = asyncio.Event()
         self._has_message = asyncio.Event()
         self._adding: dict[str, asyncio.Future[None]] = {}
-        self._numbers = itertools.count(1)
+        """By the ids of emitters that are not heard yet."""
+        self._joining: dict[str, asyncio.Future[None]] = {}
+        """By the ids of listeners who are not there yet."""
+        self._numbers = {"emitter": itertools.count(1), "listener": itertools.count(2)}
         self._task: asyncio.Task[None] | None = None
         self._failure: NafirClientError | None = None
-        self._is_closed = False
         self.is_connected = False
         """Whether there is a connection at present."""
 
@@ -199,7 +277,6 @@ class Stream:
 
     async def close(self) -> None:
         """End the stream. Blocks that have arrived can still be taken."""
-        self._is_closed = True
         if self._task is not None:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -231,7 +308,7 @@ class Stream:
 
     @property
     def listener(self) -> Pose:
-        """The newest pose of the listener."""
+        """The newest pose of the first listener."""
         start = self.scene.listener
         return self._session.listener or Pose.of(start.position, yaw=start.yaw)
 
@@ -249,26 +326,24 @@ class Stream:
     def statistics(self) -> StreamStatistics:
         return self._session.statistics
 
+    @property
+    def failure(self) -> NafirClientError | None:
+        """Why no more blocks will come; None while the stream is open."""
+        return self._arrivals.failure
+
     def __aiter__(self) -> AsyncIterator[Block]:
         return self
 
     async def __anext__(self) -> Block:
         """The oldest block that has not been taken. Waits while a lost connection is made anew. Raises
         NafirClientError if that is given up."""
-        while not self._blocks:
-            if self._is_closed:
-                raise StopAsyncIteration
-            if self._failure is not None:
-                raise self._failure
-            self._has_news.clear()
-            await self._has_news.wait()
-        return self._blocks.popleft()
+        return await self._arrivals.take()
 
     async def move_listener(
         self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
     ) -> int:
-        """Move the listener: metres, and a yaw in radians or a quaternion. Returns the pose's id, which blocks name
-        once the listener hears from there. Raises ValueError for numbers that are no pose."""
+        """Move the first listener: metres, and a yaw in radians or a quaternion. Returns the pose's id, which
+        its blocks name once it hears from there. Raises ValueError for numbers that are no pose."""
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
         return await self.change(lambda session: session.move_listener(pose, time.monotonic()))
 
@@ -288,6 +363,59 @@ class Stream:
         finally:
             self._adding.pop(state.id, None)
         return Emitter(self, state)
+
+    async def add_listener(
+        self,
+        position: Iterable[float] | None = None,
+        *,
+        yaw: float | None = None,
+        orientation: Iterable[float] | None = None,
+        id: str | None = None,  # noqa: A002  the protocol's word, as for emitters
+        hrtf: str | None = None,
+    ) -> Listener:
+        """Add a listener who hears the same emitters at the same clock, and return once it is there. Without a position
+        it begins where the scene suggests. `hrtf` names its head, by default that of the stream; without an `id` it
+        gets one.
+
+        Raises RefusedError if the server does not take it, with its id as `listener`: too_many_listeners, server_busy,
+        position_out_of_bounds, unknown_hrtf and others. The stream then goes on as it was. Raises another
+        NafirClientError if the stream ends first, and ValueError for numbers that are no pose.
+        """
+        if position is None:
+            start = self.scene.listener
+            position = start.position
+            yaw = start.yaw if yaw is None and orientation is None else yaw
+        pose = Pose.of(position, yaw=yaw, orientation=orientation)
+        identifier = id or self._free_id("listener", self._session.listeners)
+        state = await self.change(lambda session: session.add_listener(identifier, pose, hrtf))
+        joining = self._joining[identifier] = asyncio.get_running_loop().create_future()
+        arrivals = self._arrivals_of[identifier] = Arrivals()
+        try:
+            await joining
+        except BaseException:
+            self._session.remove_listener(state)
+            self._has_outgoing.set()
+            self._arrivals_of.pop(identifier, None)
+            raise
+        finally:
+            self._joining.pop(identifier, None)
+        return Listener(self, state, arrivals)
+
+    async def move_added_listener(self, state: SessionListener, pose: Pose, arrivals: Arrivals) -> int:
+        if arrivals.failure is not None:
+            raise arrivals.failure
+        return await self.change(lambda session: session.move_added_listener(state, pose, time.monotonic()))
+
+    async def remove_listener(self, state: SessionListener, arrivals: Arrivals) -> None:
+        if arrivals.failure is not None:
+            return
+        await self.change(lambda session: session.remove_listener(state))
+        self._end_listener(state.id, ClosedError(f"listener {state.id!r} was removed"))
+
+    def _end_listener(self, identifier: str, failure: NafirClientError) -> None:
+        arrivals = self._arrivals_of.pop(identifier, None)
+        if arrivals is not None:
+            arrivals.end(failure)
 
     async def wait_until_ended(self, state: SessionEmitter) -> None:
         while not state.has_ended:
@@ -348,7 +476,10 @@ class Stream:
         """The fields of an `add_emitter`, and where samples wait if it is live."""
         yaw, orientation = options.get("yaw"), options.get("orientation")
         pose = Pose.of(options.get("position", self.scene.emitter.position), yaw=yaw, orientation=orientation)
-        fields: dict[str, Any] = {"id": options.get("id") or self._free_id(), "position": pose.position}
+        fields: dict[str, Any] = {
+            "id": options.get("id") or self._free_id("emitter", self._session.emitters),
+            "position": pose.position,
+        }
         if yaw is not None or orientation is not None:
             fields["orientation"] = pose.orientation
         if "gain_db" in options:
@@ -361,8 +492,8 @@ class Stream:
             return {"loop": True, **fields, "clip": clip}, None
         return {**fields, "live": True}, self._session.live_input(options.get("ahead_blocks", 4), _LIVE_S)
 
-    def _free_id(self) -> str:
-        return next(name for number in self._numbers if (name := f"emitter-{number}") not in self._session.emitters)
+    def _free_id(self, kind: str, taken: Container[str]) -> str:
+        return next(name for number in self._numbers[kind] if (name := f"{kind}-{number}") not in taken)
 
     async def _connect_again(
         self, backoff: Backoff, started_s: float, lost: ConnectionLostError | None
@@ -415,8 +546,12 @@ class Stream:
         self.is_connected = True
         for identifier, added in self._adding.items():
             state = self._session.emitters.get(identifier)
-            if state is not None and state.is_heard and not added.done():
-                added.set_result(None)
+            if state is not None and state.is_heard:
+                _fulfil(added)
+        for identifier, joining in self._joining.items():
+            listener = self._session.listeners.get(identifier)
+            if listener is not None and listener.is_there:
+                _fulfil(joining)
         return socket
 
     async def _run(self, socket: ClientConnection) -> None:
@@ -470,11 +605,7 @@ class Stream:
     def _receive(self, data: str | bytes) -> None:
         received = self._session.receive(data, time.monotonic())
         if isinstance(received, Block):
-            if len(self._blocks) * self.block_size >= _KEPT_S * self.sample_rate:
-                self._blocks.popleft()
-                self.statistics.blocks_dropped += 1
-            self._blocks.append(received)
-            self._has_news.set()
+            self._keep(received)
         elif received is not None:
             self._has_message.set()
             self._settle(received)
@@ -482,19 +613,39 @@ class Stream:
                 self._on_message(received)
         self._pump()
 
+    def _keep(self, block: Block) -> None:
+        """Let a block wait for whoever takes it."""
+        longest = round(_KEPT_S * self.sample_rate)
+        if not block.listener:
+            self.statistics.blocks_dropped += self._arrivals.put(block, longest=longest)
+        elif (listener := self._session.listener_at(block.listener)) is not None:
+            listener.statistics.blocks_dropped += self._arrivals_of[listener.id].put(block, longest=longest)
+
     def _settle(self, message: Message) -> None:
-        """End the wait of whoever has added an emitter that is now heard, or refused."""
-        if message["type"] == "emitter_added":
-            added = self._adding.get(message["id"])
-            if added is not None and not added.done():
-                added.set_result(None)
-        elif message["type"] == "error":
-            error = refusal(message)
-            state = self._session.refused_emitter(error)
-            added = None if state is None else self._adding.get(state.id)
-            if state is not None and added is not None and not added.done():
-                self._session.forget_emitter(state)
-                added.set_exception(error)
+        """End the wait of whoever has added an emitter that is now heard or a listener who is now there, or is
+        refused."""
+        match message:
+            case {"type": "emitter_added", "id": identifier}:
+                _fulfil(self._adding.get(identifier))
+            case {"type": "listener_added", "id": identifier}:
+                _fulfil(self._joining.get(identifier))
+            case {"type": "error"}:
+                self._refuse(refusal(message))
+
+    def _refuse(self, error: RefusedError) -> None:
+        """Tell whoever has added what an error is about. A listener whom a new connection may not have ends."""
+        state = self._session.refused_emitter(error)
+        added = None if state is None else self._adding.get(state.id)
+        if state is not None and added is not None and not added.done():
+            self._session.forget_emitter(state)
+            added.set_exception(error)
+        if state is not None or (listener := self._session.refused_listener(error)) is None:
+            return
+        self._session.forget_listener(listener)
+        joining = self._joining.get(listener.id)
+        if joining is not None and not joining.done():
+            joining.set_exception(error)
+        self._end_listener(listener.id, error)
 
     def _pump(self) -> None:
         self._session.pump()
@@ -508,11 +659,18 @@ class Stream:
     def _end(self, failure: NafirClientError) -> None:
         if self._failure is None:
             self._failure = failure
-        for added in self._adding.values():
+        for added in (*self._adding.values(), *self._joining.values()):
             if not added.done():
                 added.set_exception(self._failure)
-        for event in (self._has_news, self._has_room, self._has_message, self._has_outgoing):
+        for arrivals in (self._arrivals, *self._arrivals_of.values()):
+            arrivals.end(failure)
+        for event in (self._has_room, self._has_message, self._has_outgoing):
             event.set()
+
+
+def _fulfil(wait: "asyncio.Future[None] | None") -> None:
+    if wait is not None and not wait.done():
+        wait.set_result(None)
 
 
 def _live(state: SessionEmitter) -> LiveInput:

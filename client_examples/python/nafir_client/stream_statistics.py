@@ -53,8 +53,8 @@ class PoseWaits:
 
 
 @dataclass
-class StreamStatistics:
-    """Counts since the stream began, over all its connections, and durations of late."""
+class ListenerStatistics:
+    """Counts of one listener's blocks since it began, over all connections, and durations of late."""
 
     blocks: int = 0
     blocks_late: int = 0
@@ -66,10 +66,8 @@ class StreamStatistics:
     blocks_limited: int = 0
     underruns: int = 0
     """How often a player found nothing to play."""
-    reconnections: int = 0
-    round_trip: Durations = field(default_factory=Durations)
     pose_to_sound: PoseWaits = field(default_factory=PoseWaits)
-    """From a pose of the listener or an emitter to its direct sound."""
+    """From a pose of the listener to its direct sound; of the first listener's also from those of emitters."""
     pose_to_reverberation: PoseWaits = field(default_factory=PoseWaits)
 
     def summary(self) -> dict[str, float]:
@@ -77,8 +75,21 @@ class StreamStatistics:
         counts = "blocks", "blocks_late", "blocks_skipped", "blocks_dropped", "blocks_limited", "underruns"
         return {
             **{name: getattr(self, name) for name in counts},
-            "reconnections": self.reconnections,
-            "round_trip_ms": self.round_trip.median_ms,
             "pose_to_sound_ms": self.pose_to_sound.durations.median_ms,
             "pose_to_reverberation_ms": self.pose_to_reverberation.durations.median_ms,
+        }
+
+
+@dataclass
+class StreamStatistics(ListenerStatistics):
+    """Those of the first listener, and of the stream's connections."""
+
+    reconnections: int = 0
+    round_trip: Durations = field(default_factory=Durations)
+
+    def summary(self) -> dict[str, float]:
+        return {
+            **super().summary(),
+            "reconnections": self.reconnections,
+            "round_trip_ms": self.round_trip.median_ms,
         }

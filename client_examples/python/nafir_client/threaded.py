@@ -4,12 +4,14 @@
         voice = stream.add_emitter(clip="woman-reading")
         samples = stream.read(512)  # in the callback of a sound card
 
-`read` never waits: where nothing has arrived in time it gives silence, and counts an underrun.
+`read` never waits: where nothing has arrived in time it gives silence, and counts an underrun. Other listeners of the
+stream (`add_listener`) are read for themselves.
 """
 
 import asyncio
+import contextlib
 import threading
-from collections.abc import Callable, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -18,20 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from nafir_client import stream as in_asyncio
-from nafir_client.ambisonics import Ears
 from nafir_client.backoff import Backoff
 from nafir_client.client import Client
 from nafir_client.errors import ClosedError, NafirClientError
-from nafir_client.jitter_buffer import JitterBuffer
-from nafir_client.pose import FORWARD, Orientation, Pose
+from nafir_client.playout import Playout, require_ears
+from nafir_client.pose import Pose
 from nafir_client.scene import Scene, Welcome
 from nafir_client.session import EmitterOptions, Message, StreamOptions
-from nafir_client.stream_statistics import StreamStatistics
+from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
 from nafir_client.wire import Block, Samples
 
 T = TypeVar("T")
 _OPEN_S = 60.0
-_LONGEST_S = 0.5
 _CALL_S = 15.0
 """How long calls that wait for the server may take."""
 
@@ -116,8 +116,77 @@ class ThreadedEmitter:
         self._stream.offer(self._emitter, np.array(samples, np.float32))
 
 
+class ThreadedListener:
+    """A listener of a stream beside its first, with a buffer of its own. `ThreadedStream.add_listener` makes it. Only
+    `read` is for one thread at a time, and no method waits for the server."""
+
+    def __init__(self, stream: "ThreadedStream", listener: in_asyncio.Listener, playout: Playout) -> None:
+        self._stream = stream
+        self._listener = listener
+        self._playout = playout
+
+    @property
+    def id(self) -> str:
+        return self._listener.id
+
+    @property
+    def pose(self) -> Pose:
+        """Its newest pose."""
+        return self._listener.pose
+
+    @property
+    def start_clock(self) -> int:
+        """The clock of its first block."""
+        return self._listener.start_clock
+
+    @property
+    def level(self) -> str:
+        return self._listener.level
+
+    @property
+    def output_rate(self) -> int:
+        """The rate of samples that are read."""
+        return self._playout.output_rate
+
+    @property
+    def channels(self) -> int:
+        """Those of samples that are read."""
+        return self._playout.channels
+
+    @property
+    def delay_s(self) -> float:
+        """How long sound waits before it is read."""
+        return self._playout.delay_s
+
+    @property
+    def statistics(self) -> ListenerStatistics:
+        self._listener.statistics.underruns = self._playout.underruns
+        return self._listener.statistics
+
+    @property
+    def failure(self) -> NafirClientError | None:
+        """Why nothing more will come; None while it is there."""
+        return self._listener.failure
+
+    def read(self, frames: int) -> Samples:
+        """(frame, channel) the next frames to play. Silence where nothing has arrived, and after it was removed."""
+        return self._playout.read(frames)
+
+    def move(
+        self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
+    ) -> "Future[int]":
+        """Move it, as often as you like: the newest pose counts. The future has the pose's id."""
+        pose = Pose.of(position, yaw=yaw, orientation=orientation)
+        self._playout.orientation = pose.orientation
+        return self._stream.run_later(lambda: self._listener.move(pose.position, orientation=pose.orientation))
+
+    def remove(self) -> None:
+        """Take it out of the stream."""
+        self._stream.run_later(self._listener.remove)
+
+
 class ThreadedStream:
-    """One listener in one scene. Methods may be called from any thread, `read` from one at a time."""
+    """One scene and its first listener. Methods may be called from any thread, `read` from one at a time."""
 
     def __init__(
         self,
@@ -133,25 +202,24 @@ class ThreadedStream:
         self._on_block = on_block
         self._output_rate = output_rate
         self._head = head
-        self._orientation: Orientation = FORWARD
-        self._ears: Ears | None = None
-        self._buffer: JitterBuffer | None = None
+        self._playout: Playout | None = None
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="nafir-client", daemon=True)
-        self._receiving: Future[None] | None = None
+        self._playing: set[Future[None]] = set()
+        """What hands the blocks of each listener on."""
         self._tasks: set[asyncio.Task[Any]] = set()
-        self.failure: NafirClientError | None = None
-        """Why nothing more will come; None while the stream is open."""
 
     def __enter__(self) -> Self:
         self._thread.start()
         try:
             self._run(self._stream.__aenter__(), _OPEN_S + self._stream.patience_s)
-            self._prepare()
+            playout = self._new_playout(self._output_rate, self._head)
         except BaseException:
             self.close()
             raise
-        self._receiving = asyncio.run_coroutine_threadsafe(self._receive(), self._loop)
+        playout.orientation = self._stream.listener.orientation
+        self._playout = playout
+        self._play(self._stream, playout, self._on_block)
         return self
 
     def __exit__(
@@ -164,8 +232,8 @@ class ThreadedStream:
         if not self._thread.is_alive():
             return
         self._run(self._stream.close(), _CALL_S)
-        if self._receiving is not None:
-            self._receiving.result(_CALL_S)
+        for playing in tuple(self._playing):
+            playing.result(_CALL_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
@@ -191,11 +259,11 @@ class ThreadedStream:
     @property
     def channels(self) -> int:
         """Those of samples that are read."""
-        return self._stream.channels if self._ears is None else 2
+        return self._stream.channels if self._playout is None else self._playout.channels
 
     @property
     def listener(self) -> Pose:
-        """The newest pose of the listener."""
+        """The newest pose of the first listener."""
         return self._stream.listener
 
     @property
@@ -203,30 +271,33 @@ class ThreadedStream:
         return self._stream.level
 
     @property
+    def failure(self) -> NafirClientError | None:
+        """Why nothing more will come; None while the stream is open."""
+        return self._stream.failure
+
+    @property
     def delay_s(self) -> float:
         """How long sound waits before it is read."""
-        return 0.0 if self._buffer is None else self._buffer.delay_s
+        return 0.0 if self._playout is None else self._playout.delay_s
 
     @property
     def statistics(self) -> StreamStatistics:
-        if self._buffer is not None:
-            self._stream.statistics.underruns = self._buffer.underruns
+        if self._playout is not None:
+            self._stream.statistics.underruns = self._playout.underruns
         return self._stream.statistics
 
     def read(self, frames: int) -> Samples:
         """(frame, channel) the next frames to play. Silence where nothing has arrived, and before and after the
         stream."""
-        if self._buffer is None:
-            return np.zeros((frames, 2), np.float32)
-        samples = self._buffer.read(frames)
-        return samples if self._ears is None else self._ears.process(samples, self._orientation)
+        return np.zeros((frames, 2), np.float32) if self._playout is None else self._playout.read(frames)
 
     def move_listener(
         self, position: Iterable[float], *, yaw: float | None = None, orientation: Iterable[float] | None = None
     ) -> "Future[int]":
-        """Move the listener, as often as you like: the newest pose counts. The future has the pose's id."""
+        """Move the first listener, as often as you like: the newest pose counts. The future has the pose's id."""
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
-        self._orientation = pose.orientation
+        if self._playout is not None:
+            self._playout.orientation = pose.orientation
         return self.run_later(lambda: self._stream.move_listener(pose.position, orientation=pose.orientation))
 
     def add_emitter(self, **options: Unpack[EmitterOptions]) -> ThreadedEmitter:
@@ -237,6 +308,32 @@ class ThreadedStream:
     def add_emitter_later(self, **options: Unpack[EmitterOptions]) -> "Future[ThreadedEmitter]":
         """The same without waiting."""
         return self.run_later(lambda: self._add(options))
+
+    def add_listener(
+        self,
+        position: Iterable[float] | None = None,
+        *,
+        yaw: float | None = None,
+        orientation: Iterable[float] | None = None,
+        id: str | None = None,  # noqa: A002  the protocol's word, as for emitters
+        hrtf: str | None = None,
+        head: str | None = None,
+        output_rate: int | None = None,
+        on_block: Callable[[Block], None] | None = None,
+    ) -> ThreadedListener:
+        """Add a listener who hears the same emitters, and wait until it is there, some milliseconds.
+
+        Options are those of `nafir_client.Stream.add_listener`, and `head`, `output_rate` and `on_block` as `connect`
+        has them for the first listener: of ambisonics one may hear through a head of its own, and another have the
+        channels as they come. Raises RefusedError if the server does not take it, after which the stream goes on as it
+        was, another NafirClientError if the stream ends first, TimeoutError, and ValueError.
+        """
+        playout = self._new_playout(output_rate, head)
+        adding = self._stream.add_listener(position, yaw=yaw, orientation=orientation, id=id, hrtf=hrtf)
+        listener = self._run(adding, _CALL_S)
+        playout.orientation = listener.pose.orientation
+        self._play(listener, playout, on_block)
+        return ThreadedListener(self, listener, playout)
 
     def set_level(self, level: str) -> None:
         """Choose a quality level, or `auto`."""
@@ -290,33 +387,28 @@ class ThreadedStream:
             running.cancel()
             raise
 
-    def _prepare(self) -> None:
-        welcome = self._stream.welcome
-        if self._head is not None:
-            if welcome.order is None:
-                raise ValueError("head: belongs to the output ambisonics; other outputs have `hrtf`")
-            if self.output_rate != welcome.sample_rate:
-                raise ValueError(f"output_rate: a head hears the stream's own rate, {welcome.sample_rate} Hz")
-            self._ears = Ears(
-                self._client.head_filters(self._head, order=welcome.order, sample_rate=welcome.sample_rate)
-            )
-        self._orientation = self._stream.listener.orientation
-        ahead_s = welcome.buffer_blocks * welcome.block_size / welcome.sample_rate
-        self._buffer = JitterBuffer(
-            welcome.sample_rate,
-            welcome.channels,
-            output_rate=self._output_rate,
-            longest_s=max(_LONGEST_S, 2 * ahead_s),  # what the server sends ahead has room
-        )
+    def _new_playout(self, output_rate: int | None, head: str | None) -> Playout:
+        """What plays blocks. Gets the filters of a head, if there is to be one."""
+        welcome, filters = self._stream.welcome, None
+        if head is not None:
+            order = require_ears(welcome, output_rate or welcome.sample_rate)
+            filters = self._client.head_filters(head, order=order, sample_rate=welcome.sample_rate)
+        return Playout(welcome, output_rate=output_rate, filters=filters)
 
-    async def _receive(self) -> None:
-        assert self._buffer is not None
-        try:
-            async for block in self._stream:
-                self._buffer.push(block)
-                if self._on_block is not None:
-                    self._on_block(block)
-        except NafirClientError as exc:
-            self.failure = exc
-        else:
-            self.failure = ClosedError("the stream is closed")
+    def _play(self, blocks: AsyncIterator[Block], playout: Playout, on_block: Callable[[Block], None] | None) -> None:
+        """Have the stream's thread hand the blocks of a listener on as they arrive."""
+
+        async def play() -> None:
+            with contextlib.suppress(NafirClientError):  # which is the `failure`
+                async for block in blocks:
+                    playout.push(block)
+                    if on_block is not None:
+                        on_block(block)
+
+        playing = asyncio.run_coroutine_threadsafe(play(), self._loop)
+        self._playing.add(playing)
+        playing.add_done_callback(self._played)
+
+    def _played(self, playing: "Future[None]") -> None:
+        if playing.exception() is None:  # else `close` raises it
+            self._playing.discard(playing)

@@ -20,10 +20,11 @@ Encoding = Literal[SampleEncoding, "opus"]
 
 PROTOCOL: Final = 3
 BLOCK_KIND, POSE_KIND, DRY_KIND = 1, 2, 3
-BLOCK: Final = struct.Struct("<BBHIQIII")
-"""Kind, flags, channels, sequence, sample clock, pose ids of the direct sound and of the reflected field, frames."""
-POSE: Final = struct.Struct("<B3xI7f")
-"""Kind, pose id, position, orientation."""
+BLOCK: Final = struct.Struct("<BBBBIQIII")
+"""Kind, flags, channels, number of the listener, sequence, sample clock, pose ids of the direct sound and of the
+reflected field, frames."""
+POSE: Final = struct.Struct("<BBxxI7f")
+"""Kind, number of the listener, pose id, position, orientation."""
 DRY: Final = struct.Struct("<BBHII")
 """Kind, encoding, bytes of the id, sequence, frames; then the id, filled up to four bytes, and the samples."""
 EXCHANGE, LATE, LIMITED, RESTART = 1, 2, 4, 8
@@ -57,7 +58,8 @@ class Block:
     `sample_clock` is the clock of the first frame. It jumps over blocks that the server skipped. `pose_id` is the
     newest pose of the direct sound, `reverberation_pose_id` that of the reflected field; with `is_exchange` this block
     fades to it. The server sent the block too late where `is_late`, and turned it down where `is_limited`. A block in
-    Opus may have no frames. `arrived_s` is when it arrived, by `time.monotonic`.
+    Opus may have no frames. `arrived_s` is when it arrived, by `time.monotonic`. `listener` is the number of the
+    listener in the stream, 0 for its first.
     """
 
     sequence: int
@@ -69,6 +71,7 @@ class Block:
     is_late: bool
     is_limited: bool
     arrived_s: float
+    listener: int = 0
 
     @property
     def frames(self) -> int:
@@ -112,20 +115,32 @@ def parse_packets(data: bytes, reader: PacketReader, arrived_s: float, clock_off
     return replace(block, samples=samples)
 
 
-def _parse_header(data: bytes, arrived_s: float, clock_offset: int) -> tuple[Block, int, int]:
-    """A block without its samples, and how many channels and frames it has."""
+def listener_of(data: bytes) -> int:
+    """The number of the listener whose block this is. Raises ProtocolError."""
+    _require_header(data)
+    return data[3]
+
+
+def _require_header(data: bytes) -> None:
     if len(data) < BLOCK.size:
         raise ProtocolError(f"an audio block has at least {BLOCK.size} bytes, not {len(data)}")
-    _, flags, channels, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
+
+
+def _parse_header(data: bytes, arrived_s: float, clock_offset: int) -> tuple[Block, int, int]:
+    """A block without its samples, and how many channels and frames it has."""
+    _require_header(data)
+    _, flags, channels, listener, sequence, clock, pose, reverberation_pose, frames = BLOCK.unpack_from(data)
     is_exchange, is_late, is_limited = (bool(flags & bit) for bit in (EXCHANGE, LATE, LIMITED))
     clock += clock_offset
     silence = np.zeros((0, channels), np.float32)
-    block = Block(sequence, clock, pose, reverberation_pose, silence, is_exchange, is_late, is_limited, arrived_s)
+    flags_set = is_exchange, is_late, is_limited
+    block = Block(sequence, clock, pose, reverberation_pose, silence, *flags_set, arrived_s, listener)
     return block, channels, frames
 
 
-def pose_bytes(pose: Pose, pose_id: int) -> bytes:
-    return POSE.pack(POSE_KIND, pose_id, *pose.position, *pose.orientation)
+def pose_bytes(pose: Pose, pose_id: int, listener: int = 0) -> bytes:
+    """A pose of the listener with this number, 0 for the first."""
+    return POSE.pack(POSE_KIND, listener, pose_id, *pose.position, *pose.orientation)
 
 
 def dry_bytes(emitter: str, sequence: int, samples: Samples, encoding: SampleEncoding) -> bytes:
