@@ -12,7 +12,7 @@ from server.acoustics.geometry import Pose, Quaternion
 from server.acoustics.minimum_phase import band_cepstra
 from server.protocol.client_messages import ListenerPose, MoveEmitter
 from server.rendering.direct_path import NEAR_LIMIT_M, PathTarget
-from server.rendering.hrtf import filter_taps
+from server.rendering.hrtf import KEMAR, HeadFilters, Hrtf, filter_taps
 from server.rendering.still_paths import StillPaths
 from tests.hard_cases.listening import (
     FLAT,
@@ -119,8 +119,11 @@ def test_ten_thousand_directions_are_finite_and_of_one_loudness(measured, still)
     measured("loudest to softest", max(levels_db) - min(levels_db), 20.0, "dB")
 
 
-def test_turning_a_hundredth_of_a_degree_changes_as_little(measured, still):
-    """A Lipschitz figure over random heads: the relative change per degree, largest over the sphere."""
+def test_turning_a_hundredth_of_a_degree_changes_as_little(measured):
+    """A Lipschitz figure over random headings: the relative change per degree, largest over the sphere. Of a head made
+    from its measurements, in which loudspeakers stood a few centimetres out of place."""
+    made = HeadFilters.from_hrtf(Hrtf.read(KEMAR, RATE))
+    still = StillPaths(made, speed_of_sound=343.0, air_db_per_m=FLAT)
     rng = np.random.default_rng(0)
     step = math.radians(0.01)
     worst = 0.0

@@ -52,14 +52,25 @@ def test_a_place_that_is_not_finite_is_refused_with_its_number(tmp_path, end):
         write(tmp_path, some)
 
 
-@KINDS
-def test_a_file_damaged_after_it_was_written_is_told_before_a_step_is_taken(tmp_path, configuration):
-    responses = write(tmp_path, measured_at(GRID))
-    with h5py.File(tmp_path / "data" / FILE, "r+") as file:
+def damage(folder):
+    with h5py.File(folder / FILE, "r+") as file:
         file["responses"][4, 1, 700] = np.nan
+
+
+def test_a_file_damaged_after_it_was_written_is_not_opened(tmp_path):
+    write(tmp_path, measured_at(GRID))
+    damage(tmp_path / "data")
+    with pytest.raises(ResponsesError, match=r"row 4 .* not finite"):
+        ImportedDataset.open(tmp_path / "data")
+
+
+@KINDS
+def test_a_file_damaged_after_it_was_opened_is_told_before_a_step_is_taken(tmp_path, configuration):
+    write(tmp_path, measured_at(GRID), share=0.0)
+    responses = ImportedDataset.open(tmp_path / "data")
+    damage(tmp_path / "data")
     with pytest.raises(ResponsesError, match="not finite"):
-        trained(ImportedDataset.open(tmp_path / "data"), tmp_path / "run", configuration)
-    assert responses.samples == SAMPLES
+        trained(responses, tmp_path / "run", configuration)
 
 
 @KINDS

@@ -165,12 +165,13 @@ def export(
     with tempfile.TemporaryDirectory() as trial:
         bundle = write_bundle(Path(trial), manifest, files)
         found = check_fields(bundle, EFFORT)
-        # guard: ill bundles are not exported
+        # guard: noise is not chosen for ill fields
         found.health.require()
         if isinstance(responses, SimulatedResponses) and exported[0].architecture in _OF_A_BASIS:
             files[ARRAYS_FILE] = _arrays(choose_noise(bundle, responses.dataset, seed=seed, progress=progress))
             bundle = write_bundle(Path(trial), manifest, files)
         health = check(bundle, EFFORT, fields=found)
+        # guard: ill bundles are not exported
         health.require()
     return write_bundle(folder, manifest.model_copy(update={"accepted": _needed(accepting, health)}), files)
 

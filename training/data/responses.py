@@ -329,6 +329,7 @@ def _require_finite(path: Path, responses: h5py.Dataset, listener: _Generic, emi
     size = max(1, _SAMPLES_PER_READ // (responses.shape[1] * responses.shape[2]))
     for start in range(0, len(responses), size):
         is_bad = ~np.isfinite(responses[start : start + size]).all(axis=(1, 2))
+        # guard: a damaged file is not opened
         if is_bad.any():
             row = start + int(np.argmax(is_bad))
             ends = f"listener {listener[row].tolist()}, emitter {emitter[row].tolist()}"

@@ -1,5 +1,6 @@
 """What is not healthy is not exported."""
 
+import numpy as np
 import pytest
 
 from server.api.catalogue import describe_scene
@@ -15,6 +16,7 @@ from training.bundling.export import ExportError, export
 from training.bundling.graphs import with_weights
 from training.learning.train import load_learner
 from training.models.factorised import ExportedField
+from training.models.frozen_noise import even_noise
 from training.simulation.responses import SimulatedResponses
 
 
@@ -104,6 +106,18 @@ def test_a_field_is_checked_before_its_noise_is_chosen(dataset, run, tmp_path, m
     monkeypatch.setattr(export_module, "choose_noise", choose)
     with pytest.raises(HealthError):
         export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
+
+
+def test_noise_that_breaks_a_law_is_refused_and_nothing_is_written(dataset, run, tmp_path, monkeypatch):
+    """Of a field that breaks none."""
+
+    def choose(bundle, *_, **__):
+        return 1e4 * even_noise(bundle.manifest.codec.codec, np.random.default_rng(1))
+
+    monkeypatch.setattr(export_module, "choose_noise", choose)
+    with pytest.raises(HealthError, match="largest sample"):
+        export(SimulatedResponses(dataset), [run], tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
 
 
 def test_the_manifest_says_what_its_data_do(tiny_bundle, dataset):
