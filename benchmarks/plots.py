@@ -59,7 +59,8 @@ def error_over_time(result: Result) -> Figure:
         is_offered = "(o" in name
         if p50 is not None and p99 is not None:
             axes.hlines(error, p50, p99, color="#bfdbe6", linewidth=3, zorder=1)
-        axes.scatter(time_ms, error, s=40, facecolors=_FIRST if is_offered else "white", edgecolors=_FIRST, zorder=3)
+        face, order = (_FIRST, 4) if is_offered else ("white", 3)
+        axes.scatter(time_ms, error, s=40, facecolors=face, edgecolors=_FIRST, zorder=order)
         markers.append((time_ms, error))
         if is_offered:
             said = name.split("`")[1] + (" (default)" if "default" in name else "")

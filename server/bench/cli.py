@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -168,6 +168,9 @@ def stream(
     moving_emitters: Annotated[
         bool, typer.Option("--moving-emitters", help="Emitters move as well, as often as their listener.")
     ] = False,
+    block_size: Annotated[
+        int, typer.Option(help="Samples of each block. Poses count from the next block on: short blocks cost more.")
+    ] = 256,
     as_json: AsJson = False,
 ) -> Outcome:
     """How many sessions one core serves, with fewer than one block in a thousand late.
@@ -177,7 +180,10 @@ def stream(
     of sessions takes one and a half. Each step is reported when it ends. After Ctrl-C the results so far are printed.
     """
     from server.bench.sessions import Plan, failures, measure_sessions
+    from server.protocol.client_messages import BlockSize
 
+    if block_size not in get_args(BlockSize):
+        raise NafirError(f"--block-size: {block_size} is none of {', '.join(map(str, get_args(BlockSize)))}")
     plan = Plan(
         scenes=tuple(dict.fromkeys(scene)) if scene else Plan.scenes,
         emitters=tuple(emitters) if emitters else Plan.emitters,
@@ -185,6 +191,7 @@ def stream(
         duration_s=duration_s,
         poses_per_s=poses_per_second,
         sways=moving_emitters,
+        block_size=cast("BlockSize", block_size),
     )
     measured = measure_sessions(plan, _steps_told())
     judgements = [Judgement(**row) for row in measured["summary"]]

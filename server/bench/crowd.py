@@ -23,9 +23,17 @@ from server.bench.gauge import POSE_IDS, Waiting
 from server.bench.places import Circle, Places
 from server.bench.scene import CLIP
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, MoveEmitter
+from server.protocol.client_messages import (
+    PROTOCOL,
+    Acknowledge,
+    AddEmitter,
+    BlockSize,
+    Hello,
+    ListenerPose,
+    MoveEmitter,
+)
 
-BLOCK_SIZE = 256
+BLOCK_SIZE: BlockSize = 256
 """Samples of a block: what a hello asks for if it says nothing."""
 _ACKNOWLEDGE_EVERY = 4
 _TURN_S = 12.0
@@ -81,7 +89,14 @@ class Walker(asyncio.Protocol):
     becomes impossible. With `sways` its emitters move on their circles."""
 
     def __init__(
-        self, places: Places, emitters: Sequence[Circle], *, phase: float, poses_per_s: float, sways: bool
+        self,
+        places: Places,
+        emitters: Sequence[Circle],
+        *,
+        phase: float,
+        poses_per_s: float,
+        sways: bool,
+        block_size: BlockSize = BLOCK_SIZE,
     ) -> None:
         self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.poses, self.reverberation = Waiting(), Waiting()
@@ -90,6 +105,7 @@ class Walker(asyncio.Protocol):
         self._places = places
         self._emitters = emitters
         self._sways = sways
+        self._block_size = block_size
         self._silent = len(emitters)
         self._phase = phase
         self._poses_per_s = poses_per_s
@@ -161,10 +177,13 @@ class Walker(asyncio.Protocol):
             self._transport.abort()
 
     def _begin(self) -> None:
-        self._send(
-            _TEXT,
-            Hello(protocol=PROTOCOL, scene=self._places.bundle.id, emitters=len(self._emitters)).serialize().encode(),
+        hello = Hello(
+            protocol=PROTOCOL,
+            scene=self._places.bundle.id,
+            emitters=len(self._emitters),
+            block_size=self._block_size,
         )
+        self._send(_TEXT, hello.serialize().encode())
         for number, circle in enumerate(self._emitters):
             position = circle.at(0.0) if self._sways else circle.centre
             self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=position).serialize().encode())
@@ -237,12 +256,22 @@ class Crowd:
     """The walkers at the server on `port`. Each has `emitters` emitters at places of its own, which move as often as
     the walker with `sways`. With no poses all stand still."""
 
-    def __init__(self, port: int, places: Places, *, emitters: int, poses_per_s: float, sways: bool = False) -> None:
+    def __init__(
+        self,
+        port: int,
+        places: Places,
+        *,
+        emitters: int,
+        poses_per_s: float,
+        sways: bool = False,
+        block_size: BlockSize = BLOCK_SIZE,
+    ) -> None:
         self._port = port
         self._places = places
         self.emitters = emitters
         self.poses_per_s = poses_per_s
         self._sways = sways
+        self._block_size = block_size
         self._rng = np.random.default_rng(0)
         self.walkers: list[Walker] = []
 
@@ -253,7 +282,7 @@ class Crowd:
     @property
     def blocks_per_s(self) -> float:
         """Blocks that each walker should get per second."""
-        return self._places.bundle.manifest.codec.sample_rate / BLOCK_SIZE
+        return self._places.bundle.manifest.codec.sample_rate / self._block_size
 
     async def resize(self, count: int) -> None:
         """Change to `count` walkers, and wait until all their emitters are heard. Raises ConnectionError or
@@ -285,7 +314,7 @@ class Crowd:
     async def _connect(self, number: int) -> Walker:
         emitters = self._places.emitters(self.emitters, self._rng)
         pace = {"phase": number * _GOLDEN % 1, "poses_per_s": self.poses_per_s}
-        make = partial(Walker, self._places, emitters, **pace, sways=self._sways)
+        make = partial(Walker, self._places, emitters, **pace, sways=self._sways, block_size=self._block_size)
         _, walker = await asyncio.get_running_loop().create_connection(make, "127.0.0.1", self._port)
         return walker
 

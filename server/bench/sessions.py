@@ -59,6 +59,7 @@ from server.bench.places import Places
 from server.bench.report import Goal, Judgement
 from server.bench.scene import SCENE, bundle_of
 from server.core.errors import NafirError
+from server.protocol.client_messages import BlockSize
 
 LATE_SHARE = 0.001
 _HOPELESS = 0.5
@@ -122,6 +123,7 @@ class Plan:
     """Poses per second of each listener; with 0 they stand still."""
     sways: bool = False
     """Whether emitters move as well, as often as their listener."""
+    block_size: BlockSize = BLOCK_SIZE
 
 
 def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
@@ -141,7 +143,7 @@ def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str,
     measured: dict[str, Any] = {
         "host": describe_machine(),
         "scenes": [describe_scene(each) for each in places.values()],
-        "block_size": BLOCK_SIZE,
+        "block_size": plan.block_size,
         "poses_per_s": plan.poses_per_s,
         "emitters_move": plan.sways,
         "duration_s": plan.duration_s,
@@ -293,7 +295,14 @@ async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> i
 
 async def _measure(plan: Plan, places: Places, port: int, advance: Advance, cases: list[dict[str, Any]]) -> None:
     for emitters in plan.emitters:
-        crowd = Crowd(port, places, emitters=emitters, poses_per_s=plan.poses_per_s, sways=plan.sways)
+        crowd = Crowd(
+            port,
+            places,
+            emitters=emitters,
+            poses_per_s=plan.poses_per_s,
+            sways=plan.sways,
+            block_size=plan.block_size,
+        )
         trial = Trial(port, crowd, advance)
         try:
             case = await _measure_case(plan, trial)

@@ -82,7 +82,7 @@ def test_emitters_move_with_their_listener_if_they_are_to(sways):
     emitters = places.emitters(3, np.random.default_rng(0))
 
     async def scenario():
-        walker = Walker(places, emitters, phase=0.25, poses_per_s=30.0, sways=sways)
+        walker = Walker(places, emitters, phase=0.25, poses_per_s=30.0, sways=sways, block_size=128)
         walker._transport = transport = Transport()
         walker._begin()
         for _ in range(4):
@@ -94,7 +94,7 @@ def test_emitters_move_with_their_listener_if_they_are_to(sways):
     messages, direct, reverberation = asyncio.run(scenario())
     hello, *adds = messages[:4]
     assert isinstance(hello, Hello)
-    assert hello.scene == "apartment"
+    assert (hello.scene, hello.block_size) == ("apartment", 128)
     assert [isinstance(message, AddEmitter) for message in adds] == [True] * 3
     moved = messages[4:]
     expected = [*[MoveEmitter] * 3 * sways, ListenerPose] * 4

@@ -255,6 +255,11 @@ def test_a_scene_that_is_none_is_refused_by_name():
     assert "'atlantis' is neither a bundled scene" in str(outcome.exception)
 
 
+def test_a_block_size_that_streams_lack_is_refused():
+    outcome = CliRunner().invoke(app, ["stream", "--block-size", "100"])
+    assert str(outcome.exception) == "--block-size: 100 is none of 128, 256, 512, 1024"
+
+
 class Trials:
     """Of a server with room for `capacity` sessions at first, and for as many as `long` once it is listened to for
     long."""

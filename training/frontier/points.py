@@ -86,17 +86,23 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
     """The default level: of the Pareto-optimal points whose response takes at most `ms` without the cache, and whose
     error is similar to the least one, it takes those that are about as quick as the quickest, and of them the most
-    accurate. If no response takes at most `ms`, it is the quickest."""
+    accurate. Quick is what takes least for a pose that moved and one whose head only turned. If no response takes at
+    most `ms`, it is the quickest."""
     quick = [point for point in best if point.cost.ms_miss <= ms]
     if not quick:
         return min(best, key=lambda point: point.cost.ms_miss)
     least = min(point.audible_error for point in quick)
     alike = [point for point in quick if point.audible_error <= SIMILAR_ERROR * least]
-    soonest_ms = min(point.cost.ms_miss for point in alike)
+    soonest_ms = min(map(_moved_and_turned_ms, alike))
     return min(
-        (point for point in alike if point.cost.ms_miss <= SIMILAR_TIME * soonest_ms),
+        (point for point in alike if _moved_and_turned_ms(point) <= SIMILAR_TIME * soonest_ms),
         key=lambda point: point.audible_error,
     )
+
+
+def _moved_and_turned_ms(point: Point) -> float:
+    cost = point.cost
+    return cost.ms_miss + (cost.ms_miss if cost.ms_turn is None else cost.ms_turn)
 
 
 def default_among(points: Sequence[Point], *, ms: float) -> Point:

@@ -76,6 +76,7 @@ class Frontier:
                     "is_pareto_optimal": point.level.name in best,
                     "is_offered": point.level.name in offered,
                     "is_bound": point.bound,
+                    "predicts": point.predicts,
                 }
                 for point in sorted(self.points, key=lambda point: point.cost.ms_mean)
             ],

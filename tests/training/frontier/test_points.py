@@ -18,6 +18,7 @@ def point(
     missing: float = 0.0,
     bound: bool = False,
     miss_ms: float | None = None,
+    ms_turn: float | None = None,
     predicts: Literal["ears", "directions"] = "ears",
 ) -> Point:
     """On a walk most poses take no time: the mean is what counts."""
@@ -28,7 +29,14 @@ def point(
         field="a",
         accuracy=Accuracy(pairs=PAIRS, yaws=1, errors={"t60": error}, floor={}),
         cost=Cost(
-            ms_p50=0.001, ms_p99=2 * ms, ms_mean=ms, ms_miss=miss_ms or ms, storage_mb=1, memory_mb=1, host="here"
+            ms_p50=0.001,
+            ms_p99=2 * ms,
+            ms_mean=ms,
+            ms_miss=miss_ms or ms,
+            ms_turn=ms_turn,
+            storage_mb=1,
+            memory_mb=1,
+            host="here",
         ),
     )
     return Point(level, {"t60": error}, error + spread, missing, bound, predicts)
@@ -77,6 +85,12 @@ def test_the_default_waits_for_no_difference_that_nobody_hears(error, chosen) ->
     assert default_point(best, ms=8).level.name == chosen
     assert default_point([*best, point("slower", 9, 0.1)], ms=8).level.name == chosen
     assert default_point([*best, point("d", 3.2, 0.298)], ms=8).level.name == {"b": "b", "c": "d"}[chosen]
+
+
+def test_of_two_alike_the_default_is_quicker_where_only_the_head_turned() -> None:
+    points = [point("a", 2.0, 0.3, ms_turn=1.0), point("b", 2.1, 0.298, ms_turn=2.0)]
+    assert default_point(points, ms=8).level.name == "a"
+    assert default_point([points[0], point("c", 2.1, 0.298, ms_turn=1.1)], ms=8).level.name == "c"
 
 
 def test_what_is_rarely_computed_is_no_quicker_for_it_when_it_is() -> None:
