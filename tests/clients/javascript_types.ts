@@ -1,7 +1,7 @@
 // Compiled by test_javascript.py, not run: what a user writes has the types that it should.
 
 import * as THREE from "three";
-import { connect, microphone, RefusedError, type Emitter, type Latency } from "nafir-client";
+import { connect, microphone, RefusedError, type Emitter, type Latency, type Listener } from "nafir-client";
 import { Field, type Channels } from "nafir-client/field";
 import { bind, poseOf } from "nafir-client/three";
 import { useEmitter, useNafir } from "nafir-client/react";
@@ -17,6 +17,14 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   nafir.listener.move({ position: [1, 1, 1.6], orientation: [0, 0, 0, 1] });
   nafir.addEventListener("refused", ({ detail }) => console.warn(detail.code, detail.message));
   nafir.addEventListener("state", ({ detail }) => console.log(detail.state, detail.retryMs ?? 0));
+  const second: Listener = await nafir.addListener({ position: [3, 1, 1.6], yaw: 0.5, head: "kemar" });
+  second.output.connect(context.destination);
+  second.move({ position: [3, 2, 1.6] });
+  bind(nafir, new THREE.PerspectiveCamera(), second).update();
+  nafir.addEventListener("left", ({ detail }) => console.warn(detail.id, detail.code));
+  const spectator = await nafir.addListener().catch((error: RefusedError) => error.listener);
+  console.log(typeof spectator === "string" ? spectator : spectator?.latency.direct?.totalMs, nafir.listeners.get("listener-2") === second);
+  second.remove();
   const binding = bind(nafir, new THREE.PerspectiveCamera());
   binding.add(new THREE.Object3D(), { clip: "trumpet" });
   binding.update();
@@ -26,6 +34,8 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   nafir.addEmitter({ clip: "trumpet" });
   // @ts-expect-error  a scene is rendered here or by the server
   await connect(context, "", { scene: "apartment", rendered: "there" });
+  // @ts-expect-error  a listener has no clip
+  await nafir.addListener({ clip: "trumpet" });
   // @ts-expect-error  ambisonics end at order 3
   await connect(context, "", { scene: "apartment", order: 4 });
   return nafir.latency.direct;

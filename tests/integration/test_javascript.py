@@ -90,6 +90,56 @@ def test_an_emitter_is_heard_where_it_is(page):
     assert page.evaluate("nafir.emitters.size") == 0
 
 
+def test_each_listener_has_an_output_and_hears_from_its_own_place(page):
+    connect(page, listeners=2, listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+    page.evaluate("""async () => {
+      window.second = await nafir.addListener({ position: [2.5, 4.0, 1.5], yaw: 0 });
+      second.output.connect(context.destination);
+      nafir.addEmitter({ clip: "woman-reading", position: [2.5, 3.0, 1.5] });
+    }""")
+    page.wait_for_function("nafir.latency.direct !== null && second.latency.direct !== null")
+    assert page.evaluate("nafir.welcome.max_listeners") == 8
+    on_the_left = visitor.level_db(listen(page, 2.0))
+    page.evaluate("[window.first, window.nafir] = [nafir, second]")
+    on_the_right = visitor.level_db(listen(page, 2.0))
+    assert on_the_left[0] - on_the_left[1] > 1.5
+    assert on_the_right[1] - on_the_right[0] > 1.5
+
+    page.evaluate("second.yaw = Math.PI")
+    page.wait_for_timeout(500)
+    turned = visitor.level_db(listen(page, 2.0))
+    assert turned[0] - turned[1] > 1.5
+    refused = page.evaluate("""async () => {
+      const add = (options) => first.addListener(options).catch(({ name, code, listener }) => [name, code, listener]);
+      const outside = await add({ id: "outside", position: [99, 0, 0] });
+      return [outside, await add({ id: second.id }), await add({ id: "headless", head: "nobody" })];
+    }""")
+    assert refused == [
+        ["RefusedError", "position_out_of_bounds", "outside"],
+        ["RefusedError", "duplicate_listener", "listener-2"],
+        ["RefusedError", "unknown_hrtf", "headless"],
+    ]
+    page.evaluate("second.remove()")
+    page.evaluate("window.nafir = first")
+    assert page.evaluate("nafir.listeners.size") == 0
+    assert visitor.level_db(listen(page)).max() > -60
+
+
+def test_listeners_of_an_ambisonic_stream_turn_by_themselves(page):
+    connect(page, order=1, listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+    page.evaluate("""async () => {
+      window.second = await nafir.addListener({ position: [2.5, 2.0, 1.5], yaw: Math.PI });
+      second.output.connect(context.destination);
+      nafir.addEmitter({ clip: "woman-reading", position: [2.5, 3.0, 1.5] });
+    }""")
+    page.wait_for_function("second.latency.direct !== null")
+    ahead = visitor.level_db(listen(page, 2.0))
+    page.evaluate("window.nafir = second")
+    behind = visitor.level_db(listen(page, 2.0))
+    assert ahead[0] - ahead[1] > 2
+    assert behind[1] - behind[0] > 2
+
+
 def test_the_sound_of_a_node_is_heard_from_its_place(page):
     connect(page, encoding="s16", listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
     page.evaluate("""() => {

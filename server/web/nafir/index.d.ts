@@ -51,6 +51,8 @@ export interface Refusal {
   message: string;
   field: string | null;
   emitter?: string | null;
+  /** The id of a listener beside the first. */
+  listener?: string | null;
   retry_after_s?: number;
 }
 
@@ -88,6 +90,25 @@ export interface Emitter extends Placed {
   remove(): void;
 }
 
+/** A listener beside the first of its stream. */
+export interface Listener extends Placed {
+  readonly id: string;
+  /** What this listener hears, in two channels: connect it. */
+  readonly output: AudioNode;
+  /** From setting its pose to its sound, medians of the last seconds. */
+  readonly latency: { direct: Latency | null; reverberation: Latency | null };
+  /** The last seconds that it heard, at most twelve. */
+  capture(seconds: number): Promise<{ left: Float32Array; right: Float32Array }>;
+  remove(): void;
+}
+
+/** Without a position, a listener begins where a visit of the scene does. */
+export interface ListenerOptions extends Partial<Pose> {
+  id?: string;
+  /** One of GET /v1/hrtfs; without it, the server's own or that of the stream. */
+  head?: string;
+}
+
 export interface EmitterOptions extends Pose {
   id?: string;
   /** One of GET /v1/clips. Without it, the emitter plays what `source` does or what is connected to its `input`. */
@@ -102,20 +123,28 @@ export interface EmitterOptions extends Pose {
 interface NafirEvents {
   state: CustomEvent<StateDetail>;
   refused: CustomEvent<Refusal>;
-  level: CustomEvent<{ level: string; reason: string; [more: string]: unknown }>;
-  effects: CustomEvent<{ decisions: readonly unknown[]; [more: string]: unknown }>;
-  status: CustomEvent<{ [figure: string]: unknown }>;
+  level: CustomEvent<{ level: string; reason: string; listener?: string; [more: string]: unknown }>;
+  effects: CustomEvent<{ decisions: readonly unknown[]; listener?: string; [more: string]: unknown }>;
+  status: CustomEvent<{ listener?: string; [figure: string]: unknown }>;
+  /** A listener beside the first is gone, since a new connection may not have it again. */
+  left: CustomEvent<{ id: string; code: string; message: string }>;
 }
 
 export interface Nafir extends EventTarget {
-  /** What the listener hears, in two channels: connect it. */
+  /** What the first listener hears, in two channels: connect it. */
   readonly output: AudioNode;
+  /** The first listener. */
   readonly listener: Placed;
+  /** Those beside the first. */
+  readonly listeners: ReadonlyMap<string, Listener>;
   readonly state: State;
   readonly welcome: Welcome | null;
   readonly emitters: ReadonlyMap<string, Emitter>;
   addEmitter(options: EmitterOptions): Emitter;
   removeEmitter(id: string): void;
+  /** Adds a listener who hears the same emitters at the same time. Rejects with RefusedError if the server does not take it; the stream goes on. */
+  addListener(options?: ListenerOptions): Promise<Listener>;
+  removeListener(id: string): void;
   /** Chooses a quality level of the scene, or "auto". */
   set level(name: string);
   /** Switches effects on or off by name; null leaves one to the server's plan. */
@@ -154,6 +183,8 @@ export interface ConnectOptions {
   encoding?: "f32" | "s16" | "opus";
   opus?: OpusOptions;
   bufferBlocks?: number;
+  /** How many listeners there will be, the first included, so that the server keeps room for them. */
+  listeners?: number;
   /** "here": the field runs in this browser, in ambisonics of the first order, in a context of the scene's own rate. */
   rendered?: "server" | "here";
   /** Ends the attempt. */
@@ -162,9 +193,10 @@ export interface ConnectOptions {
   assets?: string | URL;
 }
 
-/** A stream that was refused; `code` is one of the server's error codes. */
+/** A stream that was refused, or a listener in it with the id `listener`; `code` is one of the server's error codes. */
 export class RefusedError extends Error {
   readonly code: string | null;
+  readonly listener: string | null;
 }
 
 /** A request over HTTP that failed. */

@@ -21,12 +21,38 @@ export { microphone } from "./microphone.js";
 export { Output } from "./output.js";
 export { WorkerStream } from "./worker_stream.js";
 
-/** A stream that was refused. `code` is one of the server's error codes, or null. */
+/** A stream that was refused, or a listener in it, whose id is `listener` then. `code` is one of the server's error codes, or null. */
 export class RefusedError extends Error {
-  constructor(message, code = null) {
+  constructor(message, code = null, listener = null) {
     super(message);
     this.name = "RefusedError";
     this.code = code;
+    this.listener = listener;
+  }
+}
+
+/** What one listener hears: its Output, and how long poses take to be heard there. */
+class Hearing {
+  #direct = new PoseLedger();
+  #reverberation = new PoseLedger();
+  #steady = false;
+
+  constructor(sound) {
+    this.sound = sound;
+    sound.addEventListener("report", ({ detail }) => (this.#steady = detail.playing));
+    sound.addEventListener("heard", ({ detail }) => {
+      this.#direct.heard(detail, this.#steady);
+      this.#reverberation.heard({ ...detail, poseId: detail.reverberationPoseId }, this.#steady);
+    });
+  }
+
+  posed(pose) {
+    this.#direct.posed(pose);
+    this.#reverberation.posed(pose);
+  }
+
+  get latency() {
+    return { direct: this.#direct.summary(), reverberation: this.#reverberation.summary() };
   }
 }
 
@@ -99,9 +125,39 @@ class Emitter extends Placed {
   }
 }
 
+/** A listener of a stream beside its first. */
+class Listener extends Placed {
+  #nafir;
+  #hearing;
+
+  constructor(nafir, id, hearing, pose, moved) {
+    super(pose, moved);
+    this.#nafir = nafir;
+    this.#hearing = hearing;
+    this.id = id;
+    /** The AudioNode to connect: what this listener hears, in two channels. */
+    this.output = hearing.sound.node;
+  }
+
+  /** As that of the stream, of this listener's poses. */
+  get latency() {
+    return this.#hearing.latency;
+  }
+
+  /** The last `seconds` that it heard, at most twelve: {left, right}. */
+  capture(seconds) {
+    return this.#hearing.sound.capture(seconds);
+  }
+
+  remove() {
+    this.#nafir.removeListener(this.id);
+  }
+}
+
 /**
  * A stream in an AudioContext. Events: "state" (detail: {state, ...}; connecting, live, waiting, refused or closed), "refused" (detail: an
- * error of the server, after which the stream goes on), "level", "effects", "status" (details: those messages).
+ * error of the server, after which the stream goes on), "level", "effects", "status" (details: those messages, with the id of a `listener`
+ * beside the first), "left" (detail: {id, code, message} of a listener whom a new connection may not have again).
  */
 class Nafir extends EventTarget {
   #stream;
@@ -110,10 +166,11 @@ class Nafir extends EventTarget {
   #api;
   #options;
   #emitters = new Map(); // id -> {emitter, source}
-  #direct = new PoseLedger();
-  #reverberation = new PoseLedger();
-  #steady = false;
+  #hearing;
+  #others = new Map(); // id -> {listener, hearing, settle}: listeners beside the first. `settle` takes the end of their addListener
+  #filters = new Map(); // of heads for ambisonics, by name: promises
   #count = 0;
+  #listenerCount = 1;
 
   constructor(context, api, options, sound, stream) {
     super();
@@ -122,22 +179,32 @@ class Nafir extends EventTarget {
     this.#options = options;
     this.#sound = sound;
     this.#stream = stream;
-    /** The AudioNode to connect: what the listener hears, in two channels. */
+    /** The AudioNode to connect: what the stream's first listener hears, in two channels. */
     this.output = sound.node;
-    /** The pose of the head: set its `position`, `orientation` or `yaw`. */
+    /** The pose of the stream's first listener: set its `position`, `orientation` or `yaw`. */
     this.listener = new Placed(options.listener, () => this.#listenerMoved());
     /** The last welcome of the server; null before the first. */
     this.welcome = null;
     this.state = "connecting";
+    this.#hearing = new Hearing(sound);
     for (const type of ["refused", "level", "effects", "status"]) this.#pass(type);
     stream.addEventListener("posed", ({ detail }) => {
-      this.#direct.posed(detail);
-      this.#reverberation.posed(detail);
+      const { listener, ...pose } = detail;
+      if (listener === undefined) this.#hearing.posed(pose);
+      else this.#others.get(listener)?.hearing.posed(pose);
     });
-    sound.addEventListener("report", ({ detail }) => (this.#steady = detail.playing));
-    sound.addEventListener("heard", ({ detail }) => {
-      this.#direct.heard(detail, this.#steady);
-      this.#reverberation.heard({ ...detail, poseId: detail.reverberationPoseId }, this.#steady);
+    stream.addEventListener("joined", ({ detail }) => {
+      const other = this.#others.get(detail.id);
+      if (!other) return; // removed meanwhile
+      other.hearing.posed({ poseId: 0, at: now() }); // poses are numbered anew
+      other.settle?.(null);
+      other.settle = null;
+    });
+    stream.addEventListener("left", ({ detail }) => {
+      const other = this.#others.get(detail.id);
+      if (!other) return;
+      this.#endListener(detail.id, new RefusedError(detail.message, detail.code, detail.id));
+      if (!other.settle) this.dispatchEvent(new CustomEvent("left", { detail }));
     });
   }
 
@@ -147,9 +214,9 @@ class Nafir extends EventTarget {
 
   /** Resolves with the first welcome. Rejects with RefusedError, or with the reason of `signal`. */
   open(signal) {
-    const { scene, level, effects, encoding, opus, bufferBlocks, order, head, key = null } = this.#options;
-    const ambisonic = order === undefined ? {} : { output: "ambisonics", order };
-    const hello = { scene, level, effects, encoding, opus, bufferBlocks, head: order === undefined ? head : undefined, ...ambisonic };
+    const { scene, level, effects, encoding, opus, bufferBlocks, order, head, listeners, key = null } = this.#options;
+    const ambisonic = order === undefined ? { head } : { output: "ambisonics", order };
+    const hello = { scene, level, effects, encoding, opus, bufferBlocks, listeners, ...ambisonic };
     return new Promise((resolve, reject) => {
       let code = null;
       const end = (error) => {
@@ -181,28 +248,80 @@ class Nafir extends EventTarget {
       const started = { hello: { ...hello, sampleRate: this.#context.sampleRate }, listener: this.#listenerNow(), emitters: [] };
       this.#stream.open({ url: url.href, key, ...started, port });
       this.#listenerMoved();
-      if (order !== undefined) this.#listenWith(head).catch(end);
+      if (order !== undefined) this.#listenWith(this.#sound, head).catch(end);
     });
   }
 
-  /** Decodes an ambisonic stream with a head of the server. */
-  async #listenWith(head) {
+  /** Decodes what an output gets of an ambisonic stream with a head of the server. */
+  async #listenWith(sound, head) {
     const { key = null, order } = this.#options;
     const name = head ?? (await fetchJson(new URL("hrtfs", this.#api), { key })).default;
     const url = decoderUrl(this.#api, name, { order, sampleRate: this.#context.sampleRate });
     const { filters, delay_samples: delaySamples } = await fetchJson(url, { key });
-    this.#sound.listenWith({ filters, delaySamples });
+    sound.listenWith({ filters, delaySamples });
   }
 
   #listenerNow() {
-    const { position, orientation } = this.listener;
-    return { position, orientation, at: now() };
+    return this.#turned(this.#sound, this.listener);
+  }
+
+  /** The pose that a listener has now, which its output is told where it has to know. */
+  #turned(sound, { position, orientation }) {
+    const at = now();
+    if (this.#options.order !== undefined) sound.turn(orientation, at);
+    return { position, orientation, at };
   }
 
   #listenerMoved() {
-    const listener = this.#listenerNow();
-    if (this.#options.order !== undefined) this.#sound.turn(listener.orientation, listener.at);
-    this.#stream.tell("listener", listener);
+    this.#stream.tell("listener", this.#listenerNow());
+  }
+
+  /**
+   * Adds a listener who hears the same emitters at the same time, and resolves once it is there: a Listener with an `output` of its own.
+   * Options: `position` and `yaw` or `orientation` (without a position, where a visit of the scene begins), `head`, and an `id`. Rejects with
+   * RefusedError if the server does not take it (too_many_listeners, server_busy, position_out_of_bounds, unknown_hrtf); the stream goes on.
+   */
+  async addListener({ id = `listener-${++this.#listenerCount}`, head, ...pose } = {}) {
+    const { order, rendered } = this.#options;
+    if (rendered === "here") throw new RefusedError("a scene that is rendered here has one listener", "too_many_listeners", id);
+    if (this.#others.has(id)) throw new RefusedError(`there is a listener ${id} already`, "duplicate_listener", id);
+    if (this.state === "closed") throw new RefusedError("the stream is closed", null, id);
+    const { position, yaw } = this.welcome.scene.listener;
+    const sound = new Output(this.#context);
+    const hearing = new Hearing(sound);
+    const moved = () => this.#others.has(id) && this.#stream.tell("move", { id, ...this.#turned(sound, listener) });
+    const listener = new Listener(this, id, hearing, pose.position ? pose : { position, yaw, ...pose }, moved);
+    const entry = { listener, hearing, settle: null };
+    this.#others.set(id, entry);
+    const joined = new Promise((resolve, reject) => (entry.settle = (error) => (error ? reject(error) : resolve(listener))));
+    const join = () => {
+      if (this.#others.get(id) !== entry) return; // removed meanwhile
+      const port = sound.connect();
+      const start = { id, head: order === undefined ? head : undefined, ...this.#turned(sound, listener) };
+      this.#stream.tell("join", { ...start, port }, [port]);
+    };
+    if (order === undefined) join();
+    else this.#listenWith(sound, head).then(join, (error) => this.#others.get(id) === entry && this.#endListener(id, error));
+    return joined;
+  }
+
+  removeListener(id) {
+    if (!this.#others.has(id)) return;
+    this.#stream.tell("leave", { id });
+    this.#endListener(id, new RefusedError(`listener ${id} was removed`, null, id));
+  }
+
+  /** Ends the output of a listener beside the first, whose addListener fails with `error` if it still waits. */
+  #endListener(id, error) {
+    const { settle, hearing } = this.#others.get(id);
+    this.#others.delete(id);
+    settle?.(error);
+    hearing.sound.end();
+  }
+
+  /** The listeners beside the first, by id. */
+  get listeners() {
+    return new Map([...this.#others].map(([id, { listener }]) => [id, listener]));
   }
 
   /**
@@ -260,7 +379,7 @@ class Nafir extends EventTarget {
   /** Medians of the last seconds, in milliseconds, from setting a pose to its sound: {direct, reverberation}, each {totalMs, worstMs,
       serverMs, bufferMs, outputMs} or null if nothing was measured yet. */
   get latency() {
-    return { direct: this.#direct.summary(), reverberation: this.#reverberation.summary() };
+    return this.#hearing.latency;
   }
 
   /** The last `seconds` that were heard, at most twelve: {left, right}. */
@@ -274,6 +393,7 @@ class Nafir extends EventTarget {
     this.state = "closed";
     for (const { tap } of this.#emitters.values()) tap?.end();
     this.#emitters.clear();
+    for (const id of [...this.#others.keys()]) this.#endListener(id, new RefusedError("the stream is closed", null, id));
     this.#stream.end();
     this.#sound.end();
     this.dispatchEvent(new CustomEvent("state", { detail: { state: "closed" } }));
@@ -288,6 +408,7 @@ class Nafir extends EventTarget {
  * `listener` ({position, yaw or orientation}; without it, where a visit of the scene begins); `level`; `effects`; `head`; `order` (1 to 3:
  * the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32"; "s16", half as many bytes; or "opus", a tenth,
  * which is "s16" where server, browser or rate do not allow it: `welcome.encoding` says so); `opus` (its options); `bufferBlocks`;
+ * `listeners` (how many there will be, the first included, so that the server keeps room for them);
  * `rendered` ("here": the field runs in this browser, in first-order ambisonics at the scene's own rate, and the server has nothing more to
  * do; only levels whose field knows directions can); `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
  */

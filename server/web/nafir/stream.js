@@ -50,7 +50,8 @@ export class Stream {
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
   #asking = 0; // timer that asks for them again
   #encoding = "f32";
-  #opus = null; // the reader of blocks in Opus
+  #opus = null; // the reader of the first listener's blocks in Opus
+  #newOpus = () => null; // of the listener with this id, or of the first if it is null
   #token = null; // resumes the stream
   #resumeMs = 0; // for so long after the connection was lost
   #lostAt = null; // when the connection of a stream to be resumed was lost
@@ -60,14 +61,17 @@ export class Stream {
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
-  #dirty = new Set(); // "listener" and emitter ids that moved since they were last sent
+  #others = new Map(); // id -> listener beside the first: {position, orientation, head, at} and what `#entered` adds
+  #dirty = new Set(); // "listener" and ids of emitters and other listeners that moved since they were last sent
   #sentAt = 0;
   #sending = 0;
   #heartbeat = 0;
 
   /**
-   * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block), state({state, ...}),
-   * posed({poseId, at}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}).
+   * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block, id), state({state, ...}),
+   * posed({poseId, at, listener}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}),
+   * joined({id}) and left({id, code, message}). `id` and `listener` are those of a listener beside the first: `joined` says that its blocks
+   * begin, in each new stream, and `left` that it was refused and is not asked for again.
    */
   constructor({ url, key = null, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -100,6 +104,26 @@ export class Stream {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();
     }
+  }
+
+  /** Adds a listener beside the first, who hears the same emitters: {id, position, orientation, head, at}. */
+  addListener({ id, ...listener }) {
+    this.#others.set(id, { ...listener, number: null, opus: null, asked: null, hasBeen: false });
+    if (this.#isOpen) this.#askFor(id);
+  }
+
+  /** Moves a listener beside the first: {id, position, orientation, at}. */
+  moveListener({ id, ...pose }) {
+    const other = this.#others.get(id);
+    if (!other) return;
+    Object.assign(other, pose);
+    this.#dirty.add(`listener ${id}`);
+    this.#schedule();
+  }
+
+  removeListener(id) {
+    if (!this.#drop(id) || !this.#isOpen) return;
+    this.#order(message.removeListener(id));
   }
 
   /** Sends the next mono samples of a live emitter. They are dropped while it is not heard yet. */
@@ -156,6 +180,41 @@ export class Stream {
 
   #askAgain() {
     for (const id of this.#missing) this.#order(message.addEmitter(this.#emitters.get(id)));
+    for (const [id, { asked }] of this.#others) if (asked === null) this.#askFor(id);
+  }
+
+  #askFor(id) {
+    const other = this.#others.get(id);
+    other.asked = message.addListener({ id, ...other });
+    this.#order(other.asked);
+  }
+
+  /** Forgets a listener beside the first. Returns whether it was known. */
+  #drop(id) {
+    this.#others.get(id)?.opus?.close();
+    this.#dirty.delete(`listener ${id}`);
+    return this.#others.delete(id);
+  }
+
+  /** The server has a listener beside the first, under this number. */
+  #entered(id, number) {
+    const other = this.#others.get(id);
+    if (!other) return; // removed meanwhile
+    other.opus?.close();
+    Object.assign(other, { number, hasBeen: true, opus: this.#newOpus(id) });
+    this.#dirty.add(`listener ${id}`); // where it is by now
+    this.#schedule();
+  }
+
+  /** Takes an error about a listener beside the first. One who comes back with a new connection is asked for again, where the server says
+      when; any other one is not. */
+  #refusedListener({ listener: id, code, message: said, retry_after_s: retryS }) {
+    const other = this.#others.get(id);
+    if (!other || other.number !== null) return;
+    other.asked = null;
+    if (other.hasBeen && retryS) return;
+    this.#drop(id);
+    this.#listeners.left({ id, code, message: said });
   }
 
   /** Whether there is a stream that messages are for: one with a connection, or one to be resumed. */
@@ -179,6 +238,7 @@ export class Stream {
     this.#ordered = 0;
     this.#missing.clear();
     this.#dry.clear();
+    for (const other of this.#others.values()) other.number = other.asked = null;
   }
 
   /** Leaves the connection with a close code. */
@@ -186,6 +246,7 @@ export class Stream {
     clearTimeout(this.#asking);
     this.#opus?.close();
     this.#opus = null;
+    for (const other of this.#others.values()) other.opus?.close();
     clearInterval(this.#watchdog);
     clearInterval(this.#heartbeat);
     const socket = this.#socket;
@@ -207,7 +268,8 @@ export class Stream {
         return;
       }
       const { at, ...listener } = this.#listener;
-      socket.send(message.hello({ ...this.#hello, listener, emitters: this.#emitters.size }));
+      const listeners = Math.max(this.#hello.listeners ?? 0, this.#others.size && 1 + this.#others.size) || undefined;
+      socket.send(message.hello({ ...this.#hello, listener, emitters: this.#emitters.size, listeners }));
       this.#poseId = 0; // the hello's listener is pose 0
       this.#listeners.posed({ poseId: 0, at: Math.max(at, now()) });
     };
@@ -269,6 +331,7 @@ export class Stream {
     else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "plan_changed") this.#listeners.effects(received);
     else if (received.type === "emitter_added") this.#added(received.id);
+    else if (received.type === "listener_added") this.#joined(received.id, received.index);
     else if (received.type === "error") {
       this.#lastError = received.code === FORGOTTEN ? FORGOTTEN : received.message;
       if (received.code === FORGOTTEN) return; // the stream begins anew
@@ -280,8 +343,14 @@ export class Stream {
         clearTimeout(this.#asking);
         this.#asking = setTimeout(() => this.#askAgain(), comeBackMs);
       }
+      if (received.listener) this.#refusedListener(received);
       this.#listeners.refused(received);
     }
+  }
+
+  #joined(id, number) {
+    if (this.#others.has(id)) this.#listeners.joined({ id });
+    this.#entered(id, number);
   }
 
   #added(id) {
@@ -292,11 +361,10 @@ export class Stream {
   #welcome(welcome) {
     this.#welcomed = true;
     this.#encoding = welcome.encoding;
-    if (welcome.opus) {
-      const deliver = (block) => this.#listeners.block(block);
-      // A browser that fails at it gets samples.
-      this.#opus = new OpusReader(welcome.opus, deliver, () => this.renew({ encoding: "s16", opus: undefined }));
-    }
+    // A browser that fails at Opus gets samples.
+    const fail = () => this.renew({ encoding: "s16", opus: undefined });
+    this.#newOpus = (id) => (welcome.opus ? new OpusReader(welcome.opus, (block) => this.#listeners.block(block, id), fail) : null);
+    this.#opus = this.#newOpus(null);
     this.#attempt = 0;
     this.#lastError = null;
     this.#dirty.clear();
@@ -304,32 +372,61 @@ export class Stream {
     this.#resumeMs = 1000 * (welcome.resume_s ?? 0);
     this.#lostAt = null;
     this.#listeners.state({ state: "live", welcome });
-    if (welcome.resumed) this.#goOn(welcome.resumed);
-    else for (const emitter of this.#emitters.values()) this.#add(emitter);
+    if (welcome.resumed) {
+      this.#goOn(welcome.resumed);
+    } else {
+      for (const id of this.#others.keys()) this.#askFor(id); // before what they are to hear from its beginning
+      for (const emitter of this.#emitters.values()) this.#add(emitter);
+    }
     // Everything that moved between hello and welcome is in here.
     this.setListener({ ...this.#listener, at: now() });
     clearInterval(this.#heartbeat);
     this.#heartbeat = setInterval(() => {
-      if (now() - this.#sentAt >= REST_MS) this.setListener({ ...this.#listener, at: now() });
+      if (now() - this.#sentAt < REST_MS) return;
+      for (const id of this.#others.keys()) this.moveListener({ id, at: now() });
+      this.setListener({ ...this.#listener, at: now() });
     }, REST_MS);
   }
 
   /** Sends what the server had not got when the connection was lost, and where everything is now. */
-  #goOn({ handled }) {
-    const lost = Math.max(0, this.#ordered - handled);
-    for (const text of this.#orders.slice(Math.max(0, this.#orders.length - lost))) this.#send(text);
+  #goOn({ handled, listeners = [] }) {
+    const missed = Math.max(0, this.#ordered - handled);
+    const lost = this.#orders.slice(Math.max(0, this.#orders.length - missed));
+    for (const text of lost) this.#send(text);
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
+    const numbers = new Map(listeners.map(({ id, index }) => [id, index]));
+    for (const [id, other] of this.#others) {
+      if (lost.includes(other.asked)) continue; // the server is yet to have it
+      if (!numbers.has(id)) {
+        const wasThere = other.number !== null;
+        other.number = null;
+        if (!wasThere) this.#askFor(id); // else an error says why it is gone
+      } else if (other.number === null) {
+        this.#joined(id, numbers.get(id)); // which was said just before the connection was lost
+      } else {
+        this.#entered(id, numbers.get(id));
+      }
+    }
   }
 
   #receiveBlock(buffer) {
     this.#heardAt = now();
     if (!isBlock(buffer)) return; // a newer server may send other kinds
     const { header: block, packets } = this.#opus ? parsePackets(buffer) : { header: parseBlock(buffer, this.#encoding), packets: null };
-    this.#last = { sequence: block.sequence, sampleClock: block.sampleClock };
-    if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence));
+    const { sequence = 0, sampleClock = 0 } = this.#last;
+    this.#last = { sequence: Math.max(sequence, block.sequence), sampleClock: Math.max(sampleClock, block.sampleClock) }; // of all listeners
+    const [id, opus] = block.number === 0 ? [null, this.#opus] : this.#numbered(block.number);
+    if (id === undefined) return; // of a listener that was removed meanwhile
+    if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence, id ?? undefined));
     const told = { ...block, late: (block.flags & FLAG_LATE) !== 0 };
-    if (packets) this.#opus.read(told, packets, (block.flags & FLAG_RESTART) !== 0);
-    else this.#listeners.block(told);
+    if (packets) opus.read(told, packets, (block.flags & FLAG_RESTART) !== 0);
+    else this.#listeners.block(told, id);
+  }
+
+  /** The id and the reader of the listener beside the first with this number; nothing if there is none. */
+  #numbered(number) {
+    for (const [id, other] of this.#others) if (other.number === number) return [id, other.opus];
+    return [];
   }
 
   #schedule() {
@@ -348,6 +445,11 @@ export class Stream {
       if (!this.#dirty.has(`emitter ${id}`)) continue;
       this.#send(message.moveEmitter({ id, position, orientation, poseId: ++this.#poseId }));
       this.#listeners.posed({ poseId: this.#poseId, at });
+    }
+    for (const [id, { number, at, ...pose }] of this.#others) {
+      if (number === null || !this.#dirty.has(`listener ${id}`)) continue;
+      this.#send(serializePose({ poseId: ++this.#poseId, number, ...pose }));
+      this.#listeners.posed({ poseId: this.#poseId, at, listener: id });
     }
     if (this.#dirty.has("listener")) {
       const { at, ...pose } = this.#listener;

@@ -1,13 +1,19 @@
-// The worker of the stream. It passes commands from the page to a Stream, events back to the page, and audio blocks to the worklet.
+// The worker of the stream. It passes commands from the page to a Stream, events back to the page, and audio blocks to the worklet of the
+// listener who hears them.
 
 import { Stream } from "./stream.js";
 
 let stream = null;
-let playerPort = null;
+const ports = new Map(); // of the worklets: id of the listener, null for the first -> port
+let order = null; // of the stream's ambisonics
+
+/** Makes a worklet ready for a stream that counts its samples from zero. */
+const restart = (id) => ports.get(id)?.postMessage({ restart: true, order });
 
 function open({ url, key, hello, listener, emitters, port }) {
   stream?.close();
-  playerPort = port;
+  ports.clear(); // other listeners went with their stream
+  ports.set(null, port);
   const tell = (type) => (detail) => self.postMessage({ type, detail });
   stream = new Stream({
     url,
@@ -16,10 +22,11 @@ function open({ url, key, hello, listener, emitters, port }) {
     listener,
     emitters,
     listeners: {
-      block: (block) => playerPort.postMessage(block, block.channels.map((samples) => samples.buffer)),
+      block: (block, id) => ports.get(id)?.postMessage(block, block.channels.map((samples) => samples.buffer)),
       state(detail) {
         // A new stream counts its samples and poses from zero. One that goes on does not.
-        if (detail.state === "live" && !detail.welcome.resumed) playerPort.postMessage({ restart: true, order: detail.welcome.order ?? null });
+        if (detail.state === "live") order = detail.welcome.order ?? null;
+        if (detail.state === "live" && !detail.welcome.resumed) restart(null);
         self.postMessage({ type: "state", detail });
       },
       posed: tell("posed"),
@@ -27,6 +34,14 @@ function open({ url, key, hello, listener, emitters, port }) {
       level: tell("level"),
       effects: tell("effects"),
       refused: tell("refused"),
+      joined(detail) {
+        restart(detail.id);
+        self.postMessage({ type: "joined", detail });
+      },
+      left(detail) {
+        ports.delete(detail.id);
+        self.postMessage({ type: "left", detail });
+      },
     },
   });
 }
@@ -44,6 +59,15 @@ const commands = {
   open,
   tap,
   listener: (detail) => stream?.setListener(detail),
+  join({ port, ...detail }) {
+    ports.set(detail.id, port);
+    stream?.addListener(detail);
+  },
+  move: (detail) => stream?.moveListener(detail),
+  leave({ id }) {
+    stream?.removeListener(id);
+    ports.delete(id);
+  },
   emitter: (detail) => stream?.setEmitter(detail),
   remove({ id }) {
     stream?.removeEmitter(id);

@@ -1,4 +1,4 @@
-import type { Emitter, EmitterOptions, Nafir, Orientation, Position } from "./index.js";
+import type { Emitter, EmitterOptions, Nafir, Orientation, Placed, Position } from "./index.js";
 
 /** An Object3D of three.js, as much of it as is needed. */
 export interface Object3DLike {
@@ -19,4 +19,5 @@ export interface Binding {
   update(): void;
 }
 
-export function bind(nafir: Nafir, camera: Object3DLike): Binding;
+/** Binds a listener to a camera: the first one, unless another is given. */
+export function bind(nafir: Nafir, camera: Object3DLike, listener?: Placed): Binding;

@@ -46,8 +46,9 @@ function quaternion([ax, ay, az], [lx, ly, lz], [ux, uy, uz]) {
   return rows[most].map((value) => value / root);
 }
 
-/** Binds the listener to a camera, and emitters to the objects that are added. `update` sends where they are now: call it in each frame. */
-export function bind(nafir, camera) {
+/** Binds a listener to a camera, the first one unless another is given, and emitters to the objects that are added. `update` sends where they
+    are now: call it in each frame. */
+export function bind(nafir, camera, listener = nafir.listener) {
   const bound = new Map(); // object -> emitter
   const seen = new Map(); // object -> its last pose, as text
   const follow = (object, placed) => {
@@ -70,7 +71,7 @@ export function bind(nafir, camera) {
       seen.delete(object);
     },
     update() {
-      follow(camera, nafir.listener);
+      follow(camera, listener);
       for (const [object, emitter] of bound) follow(object, emitter);
     },
   };

@@ -18,11 +18,13 @@ export const FLAG_RESTART = 8; // of Opus: decoders begin anew
 /** [x, y, z, w] of a pose that has it as `orientation`, or a `yaw` counter-clockwise from +x, or neither. */
 export const orientationOf = ({ orientation, yaw = 0 }) => orientation ?? [0, 0, Math.sin(yaw / 2), Math.cos(yaw / 2)];
 
-/** A listener pose as a binary message. `position` is [x, y, z]; the direction is an orientation or a yaw. */
-export function serializePose({ poseId, position, ...direction }) {
+/** A listener pose as a binary message. `position` is [x, y, z]; the direction is an orientation or a yaw. `number` is that of a listener
+    beside the first. */
+export function serializePose({ poseId, position, number = 0, ...direction }) {
   const buffer = new ArrayBuffer(POSE_BYTES);
   const view = new DataView(buffer);
   view.setUint8(0, LISTENER_POSE);
+  view.setUint8(1, number);
   view.setUint32(4, poseId, true);
   const floats = [...position, ...orientationOf(direction)];
   floats.forEach((value, index) => view.setFloat32(8 + 4 * index, value, true));
@@ -51,6 +53,7 @@ function parseHeader(view) {
   if (view.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) throw new TypeError("not an audio block");
   return {
     flags: view.getUint8(1),
+    number: view.getUint8(3),
     sequence: view.getUint32(4, true),
     sampleClock: Number(view.getBigUint64(8, true)),
     poseId: view.getUint32(16, true),
@@ -60,15 +63,16 @@ function parseHeader(view) {
 }
 
 /**
- * An audio block as {flags, sequence, sampleClock, poseId, reverberationPoseId, frames, channels}. `channels` are Float32Array(frames):
- * both ears, equal if the block has one channel, or 4, 9 or 16 of ambisonics. The poses are the newest of the direct sound and of the
- * reflected field. `encoding` is that of the welcome: f32 or s16.
+ * An audio block as {flags, number, sequence, sampleClock, poseId, reverberationPoseId, frames, channels}. `channels` are
+ * Float32Array(frames): both ears, equal if the block has one channel, or 4, 9 or 16 of ambisonics. `number` is that of the listener who
+ * hears it, 0 for the first. The poses are the newest of the direct sound and of the reflected field. `encoding` is that of the welcome:
+ * f32 or s16.
  */
 export function parseBlock(buffer, encoding = "f32") {
   const view = new DataView(buffer);
   const header = parseHeader(view);
   const { frames } = header;
-  const count = view.getUint16(2, true);
+  const count = view.getUint8(2);
   const bytes = encoding === "s16" ? 2 : 4;
   if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * bytes) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${count} channels`);
@@ -99,10 +103,10 @@ export function parsePackets(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters }) =>
+  hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters, listeners }) =>
     JSON.stringify({
       type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
-      buffer_blocks: bufferBlocks, listener, emitters,
+      buffer_blocks: bufferBlocks, listener, emitters, listeners,
     }),
   resume: ({ token, sequence, sampleClock }) =>
     JSON.stringify({ type: "resume", protocol: PROTOCOL, token, sequence, sample_clock: sampleClock }),
@@ -113,5 +117,7 @@ export const message = {
   setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),
   moveEmitter: ({ id, position, orientation, poseId }) => JSON.stringify({ type: "move_emitter", id, position, orientation, pose_id: poseId }),
   removeEmitter: (id) => JSON.stringify({ type: "remove_emitter", id }),
-  acknowledge: (sequence) => JSON.stringify({ type: "acknowledge", sequence }),
+  addListener: ({ id, head, position, orientation }) => JSON.stringify({ type: "add_listener", id, hrtf: head, position, orientation }),
+  removeListener: (id) => JSON.stringify({ type: "remove_listener", id }),
+  acknowledge: (sequence, listener) => JSON.stringify({ type: "acknowledge", sequence, listener }),
 };

@@ -1,0 +1,191 @@
+"""Several listeners in a stream of the package for JavaScript, in Node, without a server: what it says and tells."""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from server.protocol.blocks import AudioBlock
+from server.protocol.client_messages import (
+    Acknowledge,
+    AddListener,
+    Hello,
+    ListenerPose,
+    RemoveListener,
+    Resume,
+    parse_client_message,
+)
+from tests.clients.test_javascript import HERE, MODULES, NODE
+from tests.clients.test_python_wire import WELCOME
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH (Debian: apt-get install nodejs)")
+
+NEW = {**json.loads(WELCOME), "resume_token": "t1", "resume_s": 30}
+SETTLED_MS = 30
+"""After which a pose has been sent."""
+ORIENTATION = [0.0, 0.0, 0.0, 1.0]
+
+
+def block_of(number, sequence, clock):
+    block = AudioBlock(sequence, clock, 0, 0, np.full((2, 128), (1 + number) / 8, np.float32), listener=number)
+    return {"hex": block.serialize("f32").hex()}
+
+
+def at(x):
+    return {"position": [x, 1.0, 1.5], "orientation": ORIENTATION, "at": 0}
+
+
+def entered(identifier, index):
+    return {"type": "listener_added", "id": identifier, "index": index, "sample_clock": 0, "hrtf": "kemar"}
+
+
+def refusal(code, listener, **more):
+    return {"type": "error", "code": code, "message": "no", "field": None, "listener": listener, **more}
+
+
+def resumed(**more):
+    return {**NEW, "resumed": {"sample_clock": 0, "sequence": 0, "pose_id": 0, "handled": 0, **more}}
+
+
+def run(tmp_path, *steps):
+    """For each step what was sent, as the server reads it, and what was told."""
+    folder = tmp_path / "modules"
+    shutil.copytree(MODULES, folder)
+    (folder / "package.json").write_text('{"type": "module"}')
+    command = [NODE, HERE / "javascript_listeners_driver.mjs", folder]
+    given = json.dumps({"steps": steps})
+    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    said = []
+    for log in json.loads(done.stdout):
+        sent = [
+            parse_client_message(each["text"] if "text" in each else bytes.fromhex(each["hex"]))
+            for each in log
+            if each.keys() & {"text", "hex"}
+        ]
+        told = [each for each in log if not each.keys() & {"text", "hex"}]
+        said.append((sent, told))
+    return said
+
+
+OPENED = [["open", None], ["receive", NEW], ["pause", SETTLED_MS]]
+JOINED = [["add", {"id": "p2", **at(2)}], ["receive", entered("p2", 1)], ["pause", SETTLED_MS]]
+
+
+def of(kind, said):
+    return [each for each in said[0] if isinstance(each, kind)]
+
+
+def test_a_listener_is_added_moved_acknowledged_and_removed(tmp_path):
+    opened, joined, moved, heard, removed = run(
+        tmp_path,
+        OPENED,
+        [["add", {"id": "p2", "head": "kemar", **at(2)}], ["receive", entered("p2", 7)], ["pause", SETTLED_MS]],
+        [["move", {"id": "p2", **at(3)}], ["pause", SETTLED_MS]],
+        [["receive", block_of(number, sequence, 128 * sequence)] for sequence in range(4) for number in (0, 7)],
+        [["remove", "p2"], ["receive", block_of(7, 4, 512)], ["move", {"id": "p2", **at(4)}], ["pause", SETTLED_MS]],
+    )
+    [hello] = of(Hello, opened)
+    assert hello.listeners is None
+    assert of(AddListener, joined) == [
+        AddListener(id="p2", hrtf="kemar", position=(2.0, 1.0, 1.5), orientation=(0.0, 0.0, 0.0, 1.0))
+    ]
+    assert {"joined": {"id": "p2"}} in joined[1]
+    [pose] = of(ListenerPose, moved)
+    assert (pose.index, pose.position) == (7, (3.0, 1.0, 1.5))
+    assert {"posed": {"poseId": pose.pose_id, "listener": "p2"}} in moved[1]
+    assert of(Acknowledge, heard) == [Acknowledge(sequence=3), Acknowledge(sequence=3, listener="p2")]
+    blocks = [each["block"] for each in heard[1]]
+    assert [(each["id"], each["sequence"]) for each in blocks[:3]] == [(None, 0), ("p2", 0), (None, 1)]
+    assert {each["id"]: each["first"] for each in blocks} == {None: 1 / 8, "p2": 1.0}
+    assert of(RemoveListener, removed) == [RemoveListener(id="p2")]
+    assert of(ListenerPose, removed) == []
+    assert [each for each in removed[1] if "block" in each] == []
+
+
+def test_pose_ids_rise_over_all_listeners(tmp_path):
+    third = [["add", {"id": "p3", **at(5)}], ["receive", entered("p3", 2)], ["pause", SETTLED_MS]]
+    moves = [["move", {"id": name, **at(x)}] for x in (3, 4) for name in ("p2", "p3")]
+    *_, moved = run(tmp_path, OPENED, JOINED, third, [*moves, ["pause", SETTLED_MS]])
+    poses = of(ListenerPose, moved)
+    assert [(each.index, each.position[0]) for each in poses] == [(1, 4.0), (2, 4.0)]
+    assert poses[0].pose_id < poses[1].pose_id
+
+
+def test_a_resumed_stream_has_its_listeners_and_is_sent_what_was_lost(tmp_path):
+    lost = [
+        ["receive", block_of(0, 9, 1_280)],
+        ["receive", block_of(1, 4, 1_408)],
+        ["add", {"id": "unheard", **at(3)}],
+        ["add", {"id": "lost", **at(4)}],
+        ["lose", 1006],
+        ["reconnect", None],
+        ["open", None],
+    ]
+    there = [{"id": "p2", "index": 1}, {"id": "unheard", "index": 2}]
+    _, _, asked, gone_on, heard = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        lost,
+        # It has handled two of three messages, and said of `unheard` that it is there to nobody.
+        [["receive", resumed(handled=2, listeners=there)], ["pause", SETTLED_MS]],
+        [["receive", block_of(1, 10, 2_560)], ["receive", block_of(2, 10, 2_560)]],
+    )
+    [resume] = of(Resume, asked)
+    assert (resume.token, resume.sequence, resume.sample_clock) == ("t1", 9, 1_408)
+    assert [each.id for each in of(AddListener, gone_on)] == ["lost"]
+    assert [each["joined"]["id"] for each in gone_on[1] if "joined" in each] == ["unheard"]
+    assert {each.index for each in of(ListenerPose, gone_on)} == {None, 1, 2}
+    assert [each["block"]["id"] for each in heard[1]] == ["p2", "unheard"]
+
+
+def test_a_new_stream_is_asked_for_its_listeners_again(tmp_path):
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
+    *_, hello, again = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        [["lose", 1006], ["reconnect", None], ["open", None], ["receive", forgotten], ["lose", 1008], ["open", None]],
+        [["receive", NEW], ["receive", entered("p2", 1)], ["pause", SETTLED_MS]],
+    )
+    [asked] = of(Hello, hello)
+    assert asked.listeners == 2
+    assert [each.id for each in of(AddListener, again)] == ["p2"]
+    assert {"joined": {"id": "p2"}} in again[1]
+
+
+def test_a_listener_that_is_refused_has_left_and_is_not_asked_for_again(tmp_path):
+    _, _, refused, later, other = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        [["add", {"id": "p3", **at(3)}], ["receive", refusal("server_busy", "p3", retry_after_s=0.05)]],
+        [["pause", 150], ["move", {"id": "p3", **at(4)}], ["pause", SETTLED_MS]],
+        [["receive", refusal("position_out_of_bounds", "p2")], ["receive", block_of(1, 0, 0)]],
+    )
+    assert {"left": {"id": "p3", "code": "server_busy", "message": "no"}} in refused[1]
+    assert {"refused": {"code": "server_busy", "listener": "p3"}} in refused[1]
+    assert of(AddListener, later) == []
+    assert of(ListenerPose, later) == []
+    # An error about a pose of one that is there takes nobody away.
+    assert [each for each in other[1] if "left" in each] == []
+    assert [each["block"]["id"] for each in other[1] if "block" in each] == ["p2"]
+
+
+def test_one_who_was_there_is_asked_for_again_when_a_full_server_says(tmp_path):
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
+    *_, busy, again, gone = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        [["lose", 1006], ["reconnect", None], ["open", None], ["receive", forgotten], ["lose", 1008], ["open", None]],
+        [["receive", NEW], ["receive", refusal("server_busy", "p2", retry_after_s=0.05)]],
+        [["pause", 150]],
+        [["receive", refusal("unknown_hrtf", "p2")]],
+    )
+    assert [each for each in busy[1] if "left" in each] == []
+    assert [each.id for each in of(AddListener, again)] == ["p2"]
+    assert {"left": {"id": "p2", "code": "unknown_hrtf", "message": "no"}} in gone[1]
