@@ -26,9 +26,17 @@ MESSAGES = [
     '{"type": "move_emitter", "id": "a", "position": [1, 1, 1], "pose_id": 7}',
     '{"type": "set_gain", "id": "a", "gain_db": 3.5}',
     '{"type": "set_level", "level": "auto"}',
+    '{"type": "set_effects", "effects": {"directivity": true, "hrtf": null}}',
+    '{"type": "stop_emitter", "id": "a", "stop_at": 4800, "fade_s": 0.5}',
     '{"type": "remove_emitter", "id": "a"}',
+    '{"type": "add_listener", "id": "p2", "position": [3, 2, 1.5], "yaw": 0.5, "hrtf": "kemar"}',
     '{"type": "listener", "position": [2, 2, 1.5], "yaw": 1.0, "pose_id": 9}',
+    '{"type": "listener", "position": [2, 2, 1.5], "orientation": [0, 0, 0, 1], "pose_id": 10, "listener": "p2"}',
+    '{"type": "listener", "position": [2, 2, 1.5], "pose_id": 11, "index": 1}',
+    '{"type": "remove_listener", "id": "p2"}',
     '{"type": "acknowledge", "sequence": 12}',
+    '{"type": "acknowledge", "sequence": 12, "listener": "p2"}',
+    '{"type": "resume", "protocol": 3, "token": "x", "snapshot": "y", "sequence": 7, "sample_clock": 256}',
     '{"type": "ping", "id": 5}',
 ]
 """One of each kind that a client sends as text."""
@@ -36,6 +44,7 @@ BLOCKS = [
     b"\x02\0\0\0\7\0\0\0" + np.array([2, 2, 1.5, 0, 0, 0, 1], "<f4").tobytes(),
     DryBlock("a", 3, np.ones(5, np.float32)).serialize("f32"),
     DryBlock("violin", 4, np.ones(6, np.float32)).serialize("s16"),
+    b"\x02\1\0\0\7\0\0\0" + np.array([2, 2, 1.5, 0, 0, 0, 1], "<f4").tobytes(),
 ]
 """And as bytes."""
 

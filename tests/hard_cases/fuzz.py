@@ -1,15 +1,16 @@
 """Coverage-guided fuzzing of the doors by atheris: `python tests/hard_cases/fuzz.py messages|bundles --seconds 60`.
 
-It starts from one message of each kind, or from a whole bundle, and keeps what reaches code that was not reached
-before. What is raised and is no refusal ends it, with the input written beside.
+It starts from messages of each kind and the words in them, or from a whole bundle, and keeps what reaches code that was
+not reached before. What is raised and is no refusal ends it, with the input written beside.
 """
 
 import argparse
 import io
+import json
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import atheris
@@ -33,6 +34,16 @@ from doors import (  # beside this script
 
 from server.scene.bundle import MANIFEST_FILE
 from server.scene.manifest import ARRAYS_FILE
+
+
+def words(document: object) -> Iterator[str]:
+    """Names of fields in a message, and the texts in it."""
+    if isinstance(document, dict):
+        for name, value in document.items():
+            yield name
+            yield from words(value)
+    elif isinstance(document, str):
+        yield document
 
 
 def messages(_folder: Path) -> tuple[Callable[[bytes], None], list[bytes]]:
@@ -88,8 +99,12 @@ def main() -> None:
         corpus.mkdir()
         for number, seed in enumerate(seeds):
             (corpus / str(number)).write_bytes(seed)
+        dictionary = Path(folder) / "words"
+        known = sorted({word for text in MESSAGES for word in words(json.loads(text))})
+        dictionary.write_text("".join(f'"\\"{word}\\""\n' for word in known))
         arguments = [
             sys.argv[0],
+            *([f"-dict={dictionary}"] if options.door == "messages" else []),
             f"-max_total_time={options.seconds}",
             f"-runs={options.runs}",
             "-max_len=8192",

@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from server.core.errors import RequestError
-from server.protocol.client_messages import Hello, parse_client_message
+from server.protocol.client_messages import Hello, TextMessage, parse_client_message
 from tests.hard_cases.doors import BLOCKS, MESSAGES, receive
 from tests.hard_cases.listening import Listening, not_finite
 
@@ -169,6 +170,8 @@ def test_every_kind_of_message_is_understood():
     """So that the cases above spoil what would have been heard."""
     assert all(receive(data) is not None for data in (*MESSAGES, *BLOCKS))
     assert isinstance(receive(MESSAGES[0]), Hello)
+    kinds = {message.model_fields["type"].default for message in get_args(TextMessage)}
+    assert {json.loads(text)["type"] for text in MESSAGES} == kinds
 
 
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris has no build for this platform")
