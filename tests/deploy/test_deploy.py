@@ -162,6 +162,13 @@ def test_every_metric_exists(metrics):
     assert whole <= metrics | OF_PROMETHEUS
 
 
+@pytest.mark.parametrize("name", ["nafir_ready", "nafir_streams", "nafir_listeners", "nafir_blocks_late_total"])
+def test_the_dashboard_shows_who_is_there_and_what_they_get(name):
+    panels = json.loads(DASHBOARD.read_text())["panels"]
+    shown = [target["expr"] for panel in panels for target in panel.get("targets", ())]
+    assert any(re.search(rf"\b{name}\b", expression) for expression in shown)
+
+
 def test_every_panel_has_its_place():
     panels = json.loads(DASHBOARD.read_text())["panels"]
     assert len({each["id"] for each in panels}) == len(panels)
