@@ -56,6 +56,8 @@ _WHY: Final[dict[Scarce, str]] = {
     "responses": "the server has no time left for more impulse responses",
     "opening": "too many streams begin just now",
 }
+_KindOnStep = tuple[tuple[str, int, int, int | None], str, bool]
+"""A kind of stream, its quality level, and whether it keeps later parts of responses, which makes requests cheaper."""
 _REQUEST: Final = "request", "computations"
 """How HTTP requests are counted for whose computation there is no room."""
 _HELD_SHARE: Final = 8
@@ -148,7 +150,7 @@ class Admission:
         self._time_s, self._loop_cpu_s, self._luck = time_s, loop_cpu_s, luck
         self._places: dict[Place, None] = {}
         self._by_stream: dict[Stream, Place] = {}
-        self._corrections: dict[tuple[str, int, int, int | None, str], Correction] = {}
+        self._corrections: dict[_KindOnStep, Correction] = {}
         """By kind and quality level."""
         self._cheapest: dict[tuple[str, int, int, int | None], tuple[StreamKind, QualityStep]] = {}
         self._endings_s: deque[float] = deque(maxlen=limits.endings)
@@ -195,8 +197,8 @@ class Admission:
         left = self.spare_cores - load.demand - load.eased_demand
         self.background_share = max(self._limits.least_background, left / 2) if load.streams else math.inf
         self._announce(load)
-        eased = max((stream.request_s for stream in self._engine.streams if stream.ladder.is_eased), default=0.0)
-        has_room = not self._is_on or load.streams <= 1 or fits_on_top(self._limits, self._thresholds, load, eased)
+        risen_s = max((self._request_on_top_s(stream) for stream in self._engine.streams), default=0.0)
+        has_room = not self._is_on or load.streams <= 1 or fits_on_top(self._limits, self._thresholds, load, risen_s)
         for thread in self._engine.threads:
             thread.has_room_on_top = has_room
 
@@ -457,7 +459,7 @@ class Admission:
             place.now_on,
             emitters=emitters,
             listeners=place.listeners,
-            correction=self._corrections.get((*place.kind.key, place.now_on.level), Correction()),
+            correction=self._corrections.get(_on_step(place.kind, place.now_on), Correction()),
             block_sent_s=self._block_sent_s,
             is_top=place.is_on_top,
             is_live=place.is_live,
@@ -492,6 +494,24 @@ class Admission:
             is_live=cost.is_live or expected.is_live,
         )
 
+    def _request_on_top_s(self, stream: Stream) -> float:
+        """Return the CPU time of a request for IRs if the stream stood on top of its ladder, where all are computed
+        whole."""
+        place = self._by_stream.get(stream)
+        if place is None or place.kind is None or not stream.ladder.is_eased:
+            return stream.request_s
+        top = stream.ladder.steps[0]
+        expected = expected_cost(
+            self._limits,
+            self._thresholds,
+            place.kind,
+            top,
+            emitters=stream.session.emitter_count,
+            listeners=len(stream.audience.members),
+            correction=self._corrections.get(_on_step(place.kind, top), Correction()),
+        )
+        return max(stream.request_s, expected.request_s)
+
     def _own_load(self, thread: AudioThread, streams: list[Stream]) -> ThreadLoad:
         """Return what a thread takes besides the blocks of its streams."""
         if not streams:
@@ -520,7 +540,7 @@ class Admission:
             if place.kind is None or now_s < place.until_s:
                 continue
             emitters = stream.session.emitter_count
-            key = (*place.kind.key, stream.ladder.step.level)
+            key = _on_step(place.kind, stream.ladder.step)
             correction = self._corrections.get(key, Correction())
             plain = expected_cost(
                 self._limits,
@@ -544,3 +564,7 @@ class Admission:
         """The number of emitters of the streams that came last."""
         counts = [*self._emitters, *(max(1, place.emitters) for place in self._places if place.stream is not None)]
         return round(sum(counts[-_SHOWN_EMITTERS:]) / len(counts[-_SHOWN_EMITTERS:])) if counts else 1
+
+
+def _on_step(kind: StreamKind, step: QualityStep) -> _KindOnStep:
+    return kind.key, step.level, step.late_reach_m > 0

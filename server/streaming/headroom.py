@@ -200,7 +200,8 @@ class ThreadLoad:
 class ServerLoad:
     """What all streams take. Of those on top of their ladders, `demand` is the share of a core for all their requests
     for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
-    below, `eased_demand` is the share of a core. `opening_s` is the CPU time of first IRs that are still to be
+    below, `eased_demand` is the share of a core and `eased_round_s` the CPU time of one request of each. `opening_s` is
+    the CPU time of first IRs that are still to be
     computed. `encoding` is the share of a core of all encoders."""
 
     threads: tuple[ThreadLoad, ...]
@@ -212,6 +213,7 @@ class ServerLoad:
     round_s: float = 0.0
     patience_s: float = math.inf
     eased_demand: float = 0.0
+    eased_round_s: float = 0.0
     opening_s: float = 0.0
     most_streams: int = 1
 
@@ -241,6 +243,7 @@ class ServerLoad:
             demand=max(0.0, self.demand + sign * top),
             round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
             eased_demand=max(0.0, self.eased_demand + sign * eased),
+            eased_round_s=max(0.0, self.eased_round_s + sign * (0.0 if cost.is_top else cost.request_s)),
         )
 
 
@@ -319,16 +322,20 @@ def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: in
 
 
 def fits_on_top(limits: Limits, thresholds: Thresholds, load: ServerLoad, request_s: float) -> bool:
-    """Return whether one more stream, with such requests for IRs, may step up to the top of its ladder without those
-    who are there having to step down."""
-    spare = min(float(load.workers), spare_cores(limits, thresholds, load), _spare_when_full(limits, thresholds, load))
+    """Return whether one more stream, with such requests for IRs there, may step up to the top of its ladder without
+    those who are there having to step down. Those below are served in turn with them, so they must not wait longer."""
+    spare = min(float(load.workers), spare_cores(limits, thresholds, load))
     risen = replace(
         load,
         round_s=load.round_s + request_s,
         demand=load.demand + request_s * limits.poses_hz,
         patience_s=min(load.patience_s, thresholds.patience_s),
     )
-    return _waits_are_short(limits, thresholds, risen, spare)
+    round_s, demand = risen.round_s + load.eased_round_s, risen.demand + load.eased_demand
+    most_s = limits.full_patience * risen.patience_s * spare
+    if round_s > most_s and demand > limits.full_workers * spare:
+        return False
+    return _waits_are_short(limits, thresholds, risen, min(spare, _spare_when_full(limits, thresholds, load)))
 
 
 def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> float:

@@ -11,6 +11,7 @@ from server.streaming.headroom import (
     ThreadLoad,
     blocks_needed,
     busy,
+    fits_on_top,
     headroom,
     obstacle,
     obstacle_to_change,
@@ -101,3 +102,19 @@ def test_streams_that_end_often_make_waits_short():
     assert often == pytest.approx(2.0)
     assert seldom == pytest.approx(45.0)
     assert seconds_to_next_ending(LIMITS, [1.0], 1_000.0, streams=3) == LIMITS.usual_stay_s / 3
+
+
+def test_a_stream_steps_up_to_the_top_unless_those_below_would_wait_for_it():
+    eased = StreamCost(0.02, request_s=0.003, rate_hz=12.0, patience_s=0.15)
+    one_core = replace(EMPTY, threads=(ThreadLoad(),), cores=1)
+    assert fits_on_top(LIMITS, THRESHOLDS, crowd(3, eased, one_core), 0.006)
+    assert not fits_on_top(LIMITS, THRESHOLDS, crowd(20, eased, one_core), 0.006)
+    assert not fits_on_top(LIMITS, THRESHOLDS, crowd(3, eased, one_core), 0.06), "one request takes all there is"
+
+
+def test_those_below_that_leave_take_their_requests_along():
+    eased = StreamCost(0.02, request_s=0.003, rate_hz=12.0)
+    load = crowd(3, eased)
+    assert load.eased_round_s == pytest.approx(0.009)
+    assert crowd(3, eased).minus(0, eased).eased_round_s == pytest.approx(0.006)
+    assert crowd(1, replace(eased, is_top=True)).eased_round_s == 0
