@@ -13,7 +13,7 @@ from server.acoustics.mesh import TriangleMesh
 from server.acoustics.mesh_reflections_kernel import Patches, find_patch_reflections, join
 from server.acoustics.mesh_tree import MeshTree, planes_of
 from server.acoustics.mesh_tree_kernel import STACK
-from server.acoustics.reflections import Reflections
+from server.acoustics.reflections import FirstEcho, Reflections
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int32]
@@ -28,13 +28,13 @@ _LEAST_M2 = 1e-4
 
 class MeshReflectionFinder:
     """Finds the early reflections in one mesh. `gains_db` (material, band) are the specular gains of its materials, in
-    their order. Safe to share between threads."""
+    their order. `patches` are the mesh's, if they were made already. Safe to share between threads."""
 
-    def __init__(self, tree: MeshTree, gains_db: npt.ArrayLike) -> None:
+    def __init__(self, tree: MeshTree, gains_db: npt.ArrayLike, patches: Patches | None = None) -> None:
         self._tree = tree.tree
         self._gains_db = np.array(gains_db, dtype=np.float64)
         self._surfaces = tree.mesh.surfaces
-        self._patches = _patches(tree)
+        self._patches = mirrors_of(tree) if patches is None else patches
         # Compile here, so that the first pose need not wait for it.
         self.find(np.zeros(3), np.zeros((1, 3)))
 
@@ -65,21 +65,23 @@ class MeshReflectionFinder:
 
 
 @dataclass(frozen=True)
-class TransmissionLoss:
-    """What walls take from the sound that goes straight through them. `losses_db` (material, band) is what a wall of
-    each material takes."""
+class MeshWallLosses:
+    """The walls of a mesh. `losses_db` (material, band) is what a wall of each material takes, infinite where it lets
+    no sound through."""
 
     tree: MeshTree
     losses_db: _Floats
 
-    def between(self, a: npt.ArrayLike, b: npt.ArrayLike) -> _Floats:
-        """(n, band) losses between pairs of points (n, 3), in dB; zero in sight. A wall counts once, with the material
-        by which it is entered from a."""
-        walls = self.tree.walls_between(np.asarray(a, np.float64), np.asarray(b, np.float64))
+    def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
+        """As of `server.acoustics.transmission.WallLosses`. A wall counts once, with the material by which it is
+        entered from the listener."""
+        walls = self.tree.walls_between(np.asarray(listener, np.float64), np.asarray(emitters, np.float64))
         surfaces = self.tree.mesh.surfaces
-        return np.array([self.losses_db[surfaces[each]].sum(axis=0) for each in walls]).reshape(
+        losses_db = np.array([self.losses_db[surfaces[each]].sum(axis=0) for each in walls]).reshape(
             len(walls), self.losses_db.shape[1]
         )
+        lets_through = np.isfinite(losses_db).all(axis=-1)
+        return lets_through & np.array([len(each) > 0 for each in walls], np.bool_), losses_db
 
 
 def patches_of(mesh: TriangleMesh) -> _Integers:
@@ -96,8 +98,14 @@ def patches_of(mesh: TriangleMesh) -> _Integers:
     return np.asarray(patches.reshape(-1), dtype=np.int32)
 
 
-def _patches(tree: MeshTree) -> Patches:
-    """The patches that are large enough, the largest first."""
+def first_echo_of(patches: Patches) -> FirstEcho:
+    """The lower bound of first reflections over the planes of all patches, which mirror on both sides."""
+    normals = patches.normals.T
+    return FirstEcho(np.concatenate([normals, -normals]), np.concatenate([-patches.offsets, patches.offsets]))
+
+
+def mirrors_of(tree: MeshTree) -> Patches:
+    """The patches that are large enough to mirror sound, the largest first."""
     mesh, of_triangle = tree.mesh, patches_of(tree.mesh)
     areas = np.bincount(of_triangle, mesh.areas_m2)
     kept = np.argsort(-areas, kind="stable")[: np.count_nonzero(areas >= _LEAST_M2)]

@@ -11,7 +11,15 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Points
 from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_tree_kernel import Tree, build, find_closest, find_distances, find_sight, find_walls
+from server.acoustics.mesh_tree_kernel import (
+    Tree,
+    build,
+    find_closest,
+    find_distances,
+    find_inside,
+    find_sight,
+    find_walls,
+)
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int32]
@@ -112,18 +120,15 @@ class MeshTree:
         find_distances(self.tree, flat, distances)
         return distances.reshape(places.shape[:-1])
 
-    def contains(self, points: Points) -> _Flags:
+    def contains(self, points: Points, *, is_open: bool = False) -> _Flags:
         """(...,) whether each point is in the air that the mesh encloses, or on its surfaces: whether in most
-        directions the first triangle shows its face. A few holes or flipped triangles do not change that."""
+        directions the first triangle shows its face. A few holes or flipped triangles do not change that. Under the
+        open sky, with `is_open`, a point is in the air unless triangles show it more backs than faces."""
         places = np.asarray(points, dtype=np.float64)
-        flat = places.reshape(-1, 3)
-        votes = np.zeros(len(flat), np.int64)
-        touches = np.zeros(len(flat), np.bool_)
-        for look in _LOOKS:
-            hits = self.closest(flat, look)
-            votes += hits.faces & (hits.triangle >= 0)
-            touches |= hits.distance <= SAME_PLACE_M
-        return (touches | (2 * votes > len(_LOOKS))).reshape(places.shape[:-1])
+        flat = np.ascontiguousarray(places.reshape(-1, 3))
+        inside = np.empty(len(flat), np.bool_)
+        find_inside(self.tree, _LOOKS, flat, SAME_PLACE_M, is_open, inside)
+        return inside.reshape(places.shape[:-1])
 
 
 def _pairs(a: Points, b: Points) -> tuple[_Floats, _Floats, tuple[int, ...]]:

@@ -429,6 +429,29 @@ def find_closest(
 
 
 @compiled
+def find_inside(
+    tree: Tree, looks: Floats, points: Floats, touch_m: float, is_open: bool, inside: npt.NDArray[np.bool_]
+) -> None:
+    """Fill the last array, one row for each point, from what is seen in the directions `looks`; see
+    `MeshTree.contains`."""
+    stack = np.empty(STACK, np.int32)
+    for row in range(len(points)):
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        faces, backs, touches = 0, 0, False
+        for look in range(len(looks)):
+            dx, dy, dz = looks[look, 0], looks[look, 1], looks[look, 2]
+            least = OVERLAP_M / math.sqrt(dx * dx + dy * dy + dz * dz)
+            distance, hit, is_facing = closest_hit(tree, stack, x, y, z, dx, dy, dz, least, math.inf, -1)
+            if hit >= 0:
+                touches = touches or distance <= touch_m
+                if is_facing:
+                    faces += 1
+                else:
+                    backs += 1
+        inside[row] = touches or (faces >= backs if is_open else 2 * faces > len(looks))
+
+
+@compiled
 def find_sight(tree: Tree, a: Floats, b: Floats, margin_m: float, in_sight: npt.NDArray[np.bool_]) -> None:
     """Fill the last array, one row for each pair of points; see `MeshTree.is_visible`."""
     stack = np.empty(STACK, np.int32)

@@ -26,17 +26,26 @@ _LEAST_POWER = 1e-10
 
 class FirstEcho:
     """A lower bound of the path length of the first reflection: the distance from the nearest image source, over all
-    surfaces that face both emitter and listener. Safe to share between threads."""
+    surfaces that face both emitter and listener. `normals` (surface, 3) point from planes of surfaces to where sound is
+    mirrored, and `offsets` (surface,) are the distances of the origin from the planes, along the normals. Safe to share
+    between threads."""
 
-    def __init__(self, plan: FloorPlan) -> None:
+    def __init__(self, normals: Floats, offsets: Floats) -> None:
+        self._normals = np.ascontiguousarray(normals)
+        self._offsets = np.ascontiguousarray(offsets)
+        # Compile here, so that the first pose need not wait for it.
+        self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
+
+    @classmethod
+    def of_plan(cls, plan: FloorPlan) -> "FirstEcho":
         start, end = plan.walls[:, 0], plan.walls[:, 1]
         along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
         inward = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=-1)
-        self._normals = np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
         offsets = -np.sum(inward[:, :2] * start, axis=-1)
-        self._offsets = np.concatenate([offsets, [-plan.floor_m, plan.height_m]])
-        # Compile here, so that the first pose need not wait for it.
-        self.length_m(np.zeros((1, 3)), np.zeros((1, 3)))
+        return cls(
+            np.concatenate([inward, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]]),
+            np.concatenate([offsets, [-plan.floor_m, plan.height_m]]),
+        )
 
     def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(n,) lower bounds of the path length for pairs of points (n, 3) inside the room."""

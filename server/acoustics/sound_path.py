@@ -1,11 +1,13 @@
-"""The path of the first sound from each emitter to a listener: straight if visible, otherwise around the corners of
-walls.
+"""The path of the first sound from each emitter to a listener: straight if visible, otherwise round what stands between
+them.
 
-Walls run from floor to ceiling, so a path bends in plan and rises evenly along its length. Points and unit vectors are
-(..., xyz) in world axes, in metres; bands are OCTAVE_BANDS_HZ.
+In a floor plan walls run from floor to ceiling, so a path bends in plan and rises evenly along its length. Paths in
+triangle meshes are found by `server.acoustics.mesh_paths`. Points and unit vectors are (..., xyz) in world axes, in
+metres; bands are OCTAVE_BANDS_HZ.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -64,7 +66,18 @@ class DescribedPaths:
     described: Float32
 
 
-class SoundPathFinder:
+class SoundPathFinder(Protocol):
+    """Finds the shortest paths in one place; safe to share between threads."""
+
+    def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike, into: SoundPaths | None = None) -> SoundPaths:
+        """Find the paths to `listener` (3,) from `emitters` (n, 3). They are written to `into`, which must have n rows,
+        if it is given."""
+
+    def describe(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> DescribedPaths:
+        """Describe the paths to listeners (B, 3) from emitters (B, 3), by pairs."""
+
+
+class PlanPathFinder:
     """Finds the shortest paths in one floor plan; safe to share between threads."""
 
     def __init__(self, plan: FloorPlan, speed_of_sound: float) -> None:

@@ -6,6 +6,7 @@ Res. NBS 42, 1949; Bies & Hansen, Engineering Noise Control, 4th ed., 2009, sec.
 angles up to 78 degrees and loses 5.5 dB less in octave or third-octave bands.
 """
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -60,21 +61,41 @@ class PathFinder(Protocol):
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections: ...
 
 
-class TransmittedPaths:
-    """Adds the straight paths through walls to the paths of a finder. Each wall causes a loss of `wall_loss_db`
-    (band,). Safe to share between threads if the finder is."""
+class WallLosses(Protocol):
+    """What the walls between a listener and emitters take from sound that goes straight through them."""
 
-    def __init__(self, finder: PathFinder, plan: FloorPlan, wall_loss_db: _Floats) -> None:
+    def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
+        """Return whether walls stand between that let sound through (n,), and what all of them take, in dB (n, band),
+        for a listener (3,) and emitters (n, 3)."""
+
+
+@dataclass(frozen=True)
+class PlanWallLosses:
+    """The walls of a floor plan, each of which takes `wall_loss_db` (band,)."""
+
+    plan: FloorPlan
+    wall_loss_db: _Floats
+
+    def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
+        """As of `WallLosses`."""
+        walls = walls_between(self.plan, np.asarray(listener), np.asarray(emitters))
+        return walls > 0, walls[:, None] * self.wall_loss_db
+
+
+class TransmittedPaths:
+    """Adds the straight paths through walls to the paths of a finder. Safe to share between threads if the finder
+    is."""
+
+    def __init__(self, finder: PathFinder, walls: WallLosses) -> None:
         self._finder = finder
-        self._plan = plan
-        self._wall_loss_db = wall_loss_db
+        self._walls = walls
 
     def find(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> Reflections:
         """Paths to `listener` (3,) from `emitters` (n, 3), ordered by emitter."""
         found = self._finder.find(listener, emitters)
         here, places = np.asarray(listener, dtype=np.float64), np.asarray(emitters, dtype=np.float64)
-        walls = walls_between(self._plan, here, places)
-        hidden = np.flatnonzero(walls)
+        through, losses_db = self._walls.between(here, places)
+        hidden = np.flatnonzero(through)
         offset = places[hidden] - here
         length_m = np.linalg.norm(offset, axis=-1)  # a wall stands between: never zero
         arrival = offset / length_m[:, None]
@@ -85,5 +106,5 @@ class TransmittedPaths:
             np.concatenate([found.length_m, length_m])[order],
             np.concatenate([found.arrival, arrival])[order],
             np.concatenate([found.departure, -arrival])[order],
-            np.concatenate([found.gain_db, -walls[hidden, None] * self._wall_loss_db])[order],
+            np.concatenate([found.gain_db, -losses_db[hidden]])[order],
         )

@@ -73,12 +73,12 @@ def _fill_node_cache(levels: FieldsByLevel) -> None:
     if not reusing:
         return
     fitting = NODE_CACHE_BYTES // (np.dtype(np.float32).itemsize * reusing[0].channels * reusing[0].ir_samples)
-    bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
+    bounds, surroundings = levels.bundle.manifest.bounds, levels.bundle.surroundings
     rng = np.random.default_rng(0)
     poses: list[tuple[Vector3, Vector3, float]] = []
     for _ in range(2 * fitting):
         listener, emitter = rng.uniform(bounds.minimum, bounds.maximum, (2, 3))
-        if np.all(plan.contains(np.stack([listener, emitter]))):
+        if np.all(surroundings.contains(np.stack([listener, emitter]))):
             poses.append((tuple(listener.tolist()), tuple(emitter.tolist()), rng.uniform(-math.pi, math.pi)))
     finest = max(reusing, key=lambda field: len({field.snap(*pose).node for pose in poses}))
     for listener, emitter, yaw in poses:
@@ -110,12 +110,14 @@ def _time(field: AcousticField, listener: Floats, emitter: Floats, yaw: float) -
 def _walk(levels: FieldsByLevel, seed: int, poses: int) -> list[tuple[Floats, Floats, float]]:
     """Poses of walks, each from one random place straight to another that is visible from it, with one random emitter
     per walk."""
-    bounds, plan = levels.bundle.manifest.bounds, levels.bundle.floor_plan
+    bounds, surroundings = levels.bundle.manifest.bounds, levels.bundle.surroundings
     rng = np.random.default_rng(seed)
     walk: list[tuple[Floats, Floats, float]] = []
     while len(walk) < poses:
         start, end, emitter = rng.uniform(bounds.minimum, bounds.maximum, (3, 3))
-        if not np.all(plan.contains(np.stack([start, end, emitter]))) or not plan.is_visible(start, end):
+        if not np.all(surroundings.contains(np.stack([start, end, emitter]))) or not surroundings.is_visible(
+            start, end
+        ):
             continue
         steps = math.ceil(np.linalg.norm(end - start) / _STEP_M)
         walk += [

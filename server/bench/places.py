@@ -53,11 +53,11 @@ class Places:
 
         Raises NafirError if the bounds hold hardly any place inside the walls.
         """
-        bounds, plan = self.bundle.manifest.bounds, self.bundle.floor_plan
+        bounds, surroundings = self.bundle.manifest.bounds, self.bundle.surroundings
         found: list[Circle] = []
         for _ in range(_TRIES * count):
             x, y, z = rng.uniform(bounds.minimum, bounds.maximum).tolist()
-            if plan.holds((x, y, z)):
+            if surroundings.holds((x, y, z)):
                 found.append(largest_circle(self.bundle, (x, y, z), _SWAY_M))
                 if len(found) == count:
                     return found
@@ -77,7 +77,7 @@ def largest_circle(bundle: Bundle, centre: Vector3, most_m: float) -> Circle:
 
 
 def _is_free(bundle: Bundle, points: Sequence[Vector3], centre: Vector3) -> bool:
-    bounds, plan = bundle.manifest.bounds, bundle.floor_plan
+    bounds, surroundings = bundle.manifest.bounds, bundle.surroundings
     at = np.asarray(points)
-    is_allowed = np.all((at >= bounds.minimum) & (at <= bounds.maximum), axis=-1) & plan.contains(at)
-    return bool(np.all(is_allowed & plan.is_visible(np.asarray(centre), at)))
+    is_allowed = np.all((at >= bounds.minimum) & (at <= bounds.maximum), axis=-1) & surroundings.contains(at)
+    return bool(np.all(is_allowed & surroundings.is_visible(np.asarray(centre), at)))

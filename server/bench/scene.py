@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import yaws_of
-from server.acoustics.sound_path import SoundPathFinder
 from server.bench.rooms import FloatArray, room
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -75,7 +74,7 @@ class BankField(AcousticField):
     def __init__(self) -> None:
         self.bundle = bundle_of(SCENE)
         self.level = _MANIFEST.levels[0]
-        self._paths = SoundPathFinder(self.bundle.floor_plan, _MANIFEST.speed_of_sound)
+        self._paths = self.bundle.surroundings.sound_paths(_MANIFEST.speed_of_sound)
         self._bank = np.stack([_LEVEL * room(seed, _SAMPLES) for seed in range(_BANK)])
 
     def through(self, filters: HeadFilters) -> "BankField":  # noqa: ARG002  its responses were recorded

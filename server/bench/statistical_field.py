@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.field.kinds.every_pose import ComputedResponses
 from server.rendering.hrtf import HeadFilters, kemar
@@ -108,7 +107,7 @@ class StatisticalField(AcousticField):
         )
         self.level = self.bundle.manifest.levels[0]
         self.source = ComputedResponses(self.impulse_responses)
-        self._paths = SoundPathFinder(self.bundle.floor_plan, self.bundle.manifest.speed_of_sound)
+        self._paths = self.bundle.surroundings.sound_paths(self.bundle.manifest.speed_of_sound)
 
     def through(self, filters: HeadFilters) -> "StatisticalField":  # noqa: ARG002  one head is as good as another
         return self

@@ -134,7 +134,7 @@ class AcousticField:
         self._lead = 0 if is_whole else graph.parameters.lead_samples
         self._first_echo: FirstEcho | None = None
         if not is_whole and not graph.gives_responses:
-            self._first_echo = FirstEcho(bundle.floor_plan)
+            self._first_echo = bundle.surroundings.first_echo()
         self._gate = Gate(
             graph.parameters,
             rise_s=_RISE_AFTER_FIRST_S if self._first_echo and bundle.manifest.image_order else RISE_S,
@@ -500,7 +500,7 @@ class Silence(AcousticField):
         self.level = level
         self._sample_rate = bundle.manifest.codec.sample_rate if sample_rate is None else sample_rate
         self.source = ComputedResponses(self.impulse_responses)
-        self._paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+        self._paths = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
 
     @property
     def sample_rate(self) -> int:

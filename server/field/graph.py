@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from server.acoustics.cells import Axis
 from server.acoustics.geometry import yaws_of
-from server.acoustics.sound_path import DESCRIPTION, DescribedPaths, SoundPathFinder
+from server.acoustics.sound_path import DESCRIPTION, DescribedPaths
 from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.rendering.hrtf import HeadFilters
@@ -117,7 +117,7 @@ class FieldGraph:
             raise BundleError(
                 self._path, "inputs", f"are {inputs}, expected {expected} after the batch axis, or all but {PATH}"
             )
-        self.paths = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+        self.paths = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
         """Finds the paths of the graph's poses."""
         if any(outputs.get(output) != _TENSOR for output in self._shapes):
             raise BundleError(self._path, "outputs", f"are {outputs}, expected {self._expected_outputs}")

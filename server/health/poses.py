@@ -20,11 +20,11 @@ _QUARTERS = np.array([0.0, 0.5, 1.0, -0.5]) * np.pi
 
 def allowed(bundle: Bundle, poses: Poses) -> npt.NDArray[np.bool_]:
     """(pose,) whether listener and emitter are within bounds and not inside a wall."""
-    bounds, plan = bundle.manifest.bounds, bundle.floor_plan
+    bounds, surroundings = bundle.manifest.bounds, bundle.surroundings
     return np.asarray(
         np.logical_and.reduce(
             [
-                np.all((ends >= bounds.minimum) & (ends <= bounds.maximum), axis=-1) & plan.contains(ends)
+                np.all((ends >= bounds.minimum) & (ends <= bounds.maximum), axis=-1) & surroundings.contains(ends)
                 for ends in (poses[:, LISTENER], poses[:, EMITTER])
             ]
         )

@@ -82,10 +82,10 @@ def steepest(
 ) -> Steps:
     """Single steps with a large change. Of the moves of sixteen steps, the `kept` with the greatest change are halved
     again and again, each time keeping the half with more change. A jump anywhere on a move is in one of its halves."""
-    plan = bundle.floor_plan
+    surroundings = bundle.surroundings
     usable = allowed(bundle, poses) & allowed(bundle, moved)
     for part in (LISTENER, EMITTER):  # moves do not go through walls
-        usable &= plan.is_visible(poses[:, part], moved[:, part])
+        usable &= surroundings.is_visible(poses[:, part], moved[:, part])
     start, end = poses[usable], moved[usable]
     before, after = energies(start), energies(end)
     order = np.argsort(-known(change(Steps(start, end, before, after))))[:kept]

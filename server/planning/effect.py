@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from server.acoustics.decibels import db_to_power
-from server.acoustics.sound_path import SoundPathFinder
 from server.planning.change import Change
 from server.planning.cost import NOTHING, Cost, Measured, PerPose, Variant
 from server.planning.prediction import UNTOUCHED, Factors, Floats, Mirrored, Prediction, Way
@@ -120,6 +119,6 @@ class SharedEffect(Effect):
 
 def _along_paths(gain_db: PathGain, bundle: Bundle, count: int) -> Callable[[], object]:
     start = bundle.manifest.start
-    finder = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+    finder = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
     paths = finder.find(np.array(start.listener), np.tile(start.emitter, (count, 1)))
     return lambda: gain_db(paths)

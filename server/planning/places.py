@@ -59,8 +59,8 @@ def place_of(
         speed_of_sound=manifest.speed_of_sound,
         air_db_per_m=manifest.air.filter_db_per_m,
         nearest_m=NEAR_LIMIT_M,
-        plan=None if manifest.geometry is None else manifest.geometry.floor_plan,
-        materials=manifest.geometry.materials if manifest.geometry is not None and manifest.image_order else None,
+        surroundings=None if bundle.surfaces is None else bundle.surroundings,
+        surfaces=bundle.surfaces if manifest.image_order else None,
         reverberation=_typical(known) if known else None,
         reverberations=known,
         transmits=manifest.transmission,
@@ -181,6 +181,6 @@ def _pairs(bundle: Bundle) -> list[tuple[Vector3, Vector3]]:
     while len(places) < 2 * (_PAIRS - 1):
         x, y, z = (float(at) for at in rng.uniform(bounds.minimum, bounds.maximum))
         place = x, y, z
-        if bundle.floor_plan.holds(place):
+        if bundle.surroundings.holds(place):
             places.append(place)
     return list(zip(places[::2], places[1::2], strict=True))

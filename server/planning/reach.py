@@ -105,8 +105,8 @@ def _within_reach(points: Floats, speeds_m_s: list[float], place: SceneAcoustics
     courses = np.stack([np.cos(angle), np.sin(angle), np.zeros(_COURSES)], axis=-1)
     far = HORIZON_S * np.asarray(speeds_m_s)[:, None] * courses[:, None]
     ends, halfway = (np.clip(points + way, place.minimum, place.maximum) for way in (far, far / 2))
-    if place.plan is not None:
-        inside = place.plan.contains(np.stack([ends, halfway]))[..., None]
+    if place.surroundings is not None:
+        inside = place.surroundings.contains(np.stack([ends, halfway]))[..., None]
         ends = np.where(inside[0], ends, np.where(inside[1], halfway, points))
     return np.concatenate([points[np.newaxis], ends])
 

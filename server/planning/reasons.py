@@ -25,7 +25,7 @@ _PARAMETERS = {
 
 def nothing_in_the_way(place: SceneAcoustics) -> str:
     """Return why nothing can block the direct sound; empty where something can."""
-    if place.plan is None:
+    if place.surroundings is None:
         return "no walls are known that could stand in the way"
     return "the room is convex: nothing can stand in the way" if place.paths is None else ""
 

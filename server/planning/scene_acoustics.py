@@ -12,14 +12,15 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ
+from server.acoustics.bands import FILTER_BANDS_HZ
 from server.acoustics.directivity import OMNIDIRECTIONAL
-from server.acoustics.geometry import FloorPlan, Pose, Vector3
-from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
+from server.acoustics.geometry import Pose, Vector3
 from server.acoustics.sound_path import SoundPathFinder
-from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
+from server.acoustics.surroundings import Surroundings
+from server.acoustics.transmission import PathFinder
 from server.responses.emitter_state import EmitterState
-from server.scene.geometry import Materials
+from server.scene.geometry import Material
+from server.scene.surfaces import mirror_gains_db, wall_losses_db
 
 Output = Literal["headphones", "mono", "ambisonics"]
 """Where the sound goes: to two ears, to one loudspeaker, or to a client that decodes ambisonic channels."""
@@ -93,8 +94,9 @@ class SceneAcoustics:
     """The acoustics of a scene, which never change. Two places are equal only if they are the same object. Safe to
     share between threads.
 
-    `minimum` and `maximum` bound all positions. Nearer than `nearest_m`, sound gets no louder. `plan` is None in the
-    open, and where the walls are unknown; `materials` are set where first reflections come from geometry.
+    `minimum` and `maximum` bound all positions. Nearer than `nearest_m`, sound gets no louder. `surroundings` are None
+    in the open, and where the walls are unknown; the materials of their `surfaces` are set where first reflections come
+    from geometry.
     `reverberation` is typical of the place and set where it has a field; with `holds_direct_sound` the field's
     responses contain all sound. If the scene `transmits`, sound also goes through walls whose mass is known, and is
     rendered with the first reflections. The late tails that emitters could share begin `tail_start_s` after emission;
@@ -108,8 +110,8 @@ class SceneAcoustics:
     speed_of_sound: float
     air_db_per_m: Bands
     nearest_m: float
-    plan: FloorPlan | None = None
-    materials: Materials | None = None
+    surroundings: Surroundings | None = None
+    surfaces: tuple[Material, ...] | None = None
     reverberation: Reverberation | None = None
     holds_direct_sound: bool = False
     transmits: bool = False
@@ -119,22 +121,18 @@ class SceneAcoustics:
     @cached_property
     def paths(self) -> SoundPathFinder | None:
         """The path finder of the direct sound; None where nothing can block it."""
-        if self.plan is None or not len(self.plan.bend_corners):
+        if self.surroundings is None or not self.surroundings.has_obstacles:
             return None
-        return SoundPathFinder(self.plan, self.speed_of_sound)
+        return self.surroundings.sound_paths(self.speed_of_sound)
 
     @cached_property
     def reflections(self) -> PathFinder | None:
         """The path finder of first reflections and, where the scene transmits, of sound straight through walls; None
         without materials."""
-        if self.plan is None or self.materials is None:
+        if self.surroundings is None or self.surfaces is None:
             return None
-        surfaces = self.materials.walls, self.materials.floor, self.materials.ceiling
-        gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
-        finder, mass = ReflectionFinder(self.plan, gains_db), self.materials.walls.surface_mass_kg_m2
-        if not self.transmits or mass is None:
-            return finder
-        return TransmittedPaths(finder, self.plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
+        losses_db = wall_losses_db(self.surfaces) if self.transmits else None
+        return self.surroundings.first_reflections(mirror_gains_db(self.surfaces), losses_db)
 
     @cached_property
     def band_shares(self) -> Bands:

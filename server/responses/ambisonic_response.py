@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import LEVEL, Pose, orientations_of
-from server.acoustics.sound_path import SoundPathFinder
 from server.acoustics.spherical_harmonics import harmonic_count, rotation
 from server.core.errors import RequestError
 from server.field.field import AcousticField
@@ -33,7 +32,7 @@ class AmbisonicResponse:
         manifest = field.bundle.manifest
         no_head = NoHead(field.sample_rate)
         self._field = field
-        self._finder = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
+        self._finder = field.bundle.surroundings.sound_paths(manifest.speed_of_sound)
         self._waves = StillPaths(
             no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m
         )

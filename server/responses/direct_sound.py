@@ -15,7 +15,8 @@ import numpy.typing as npt
 from server.acoustics.decibels import amplitude_to_db, db_to_amplitude
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose
-from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from server.acoustics.sound_path import PlanPathFinder, SoundPathFinder, SoundPaths
+from server.acoustics.surroundings import Surroundings
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.head_decoder import HeadDecoder
@@ -94,7 +95,7 @@ class DirectSound:
 
     def __init__(
         self,
-        plan: FloorPlan,
+        surroundings: Surroundings,
         *,
         speed_of_sound: float,
         air_db_per_m: npt.NDArray[np.float64],
@@ -111,8 +112,8 @@ class DirectSound:
         self.binauralization = binauralization
         self.field_gain = field_gain
         self.order = order
-        self._finder = SoundPathFinder(plan, speed_of_sound)
-        self._straight = SoundPathFinder(_IN_THE_OPEN, speed_of_sound)
+        self._finder = surroundings.sound_paths(speed_of_sound)
+        self._straight = PlanPathFinder(_IN_THE_OPEN, speed_of_sound)
         self._speed_of_sound = speed_of_sound
         self._air_db_per_m = air_db_per_m
         self._filters = filters
@@ -131,7 +132,7 @@ class DirectSound:
         same head at the scene's rate."""
         manifest = bundle.manifest
         return cls(
-            bundle.floor_plan,
+            bundle.surroundings,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.filter_db_per_m,
             filters=filters if manifest.direct_sound == "geometry" else None,

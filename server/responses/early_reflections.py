@@ -20,9 +20,8 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db, db_to_power
 from server.acoustics.directivity import OMNIDIRECTIONAL
-from server.acoustics.geometry import FloorPlan, Pose
-from server.acoustics.reflections import ReflectionFinder, mirror_gain_db
-from server.acoustics.transmission import PathFinder, TransmittedPaths, transmission_loss_db
+from server.acoustics.geometry import Pose
+from server.acoustics.surroundings import Surroundings
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import TAPS
 from server.rendering.hrtf import HeadFilters, NoHead
@@ -30,7 +29,8 @@ from server.rendering.still_paths import StillPaths
 from server.responses.emitter_state import EmitterState
 from server.responses.radiation import departure_gain_db, reverberation_gain
 from server.scene.bundle import Bundle
-from server.scene.geometry import Materials
+from server.scene.geometry import Material
+from server.scene.surfaces import mirror_gains_db, wall_losses_db
 
 _Floats = npt.NDArray[np.float64]
 
@@ -44,25 +44,23 @@ class EarlyReflections:
 
     def __init__(
         self,
-        plan: FloorPlan,
-        materials: Materials,
+        surroundings: Surroundings,
+        surfaces: Sequence[Material],
         *,
         speed_of_sound: float,
         air_db_per_m: _Floats,
         filters: HeadFilters | NoHead,
         transmission: bool = False,
     ) -> None:
-        """With `transmission`, sound that goes straight through walls, attenuated by their mass, is added as well."""
-        surfaces = materials.walls, materials.floor, materials.ceiling
-        gains_db = [mirror_gain_db(surface.absorption, surface.scattering) for surface in surfaces]
+        """`surfaces` are the materials of the surroundings. With `transmission`, sound that goes straight through
+        walls, attenuated by their mass, is added as well."""
         self.filters = filters
-        self._finder: PathFinder = ReflectionFinder(plan, gains_db)
-        mass = materials.walls.surface_mass_kg_m2
-        if transmission and mass is not None:
-            self._finder = TransmittedPaths(self._finder, plan, transmission_loss_db(mass, OCTAVE_BANDS_HZ))
-        # Each of the two legs of a path is at most as long as the room's diagonal.
-        (west, south), (east, north) = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
-        longest_s = 2 * math.hypot(east - west, north - south, plan.height_m) / speed_of_sound
+        self._finder = surroundings.first_reflections(
+            mirror_gains_db(surfaces), wall_losses_db(surfaces) if transmission else None
+        )
+        # Each of the two legs of a path is at most as long as the diagonal of the place.
+        low, high = surroundings.bounds_m
+        longest_s = 2 * math.hypot(*(high - low)) / speed_of_sound
         self.end_samples = math.ceil((longest_s + filters.longest_delay_s) * filters.sample_rate) + filters.taps + TAPS
         """The sample of a response from which on it contains no reflection."""
         self._air_db_per_m = air_db_per_m
@@ -72,12 +70,11 @@ class EarlyReflections:
     def of(cls, bundle: Bundle, filters: HeadFilters | NoHead) -> "EarlyReflections | None":
         """Return the first reflections of a bundle's scene; None if the responses of its fields include them."""
         manifest = bundle.manifest
-        geometry = manifest.geometry
-        if manifest.image_order == 0 or geometry is None:
+        if manifest.image_order == 0 or bundle.surfaces is None:
             return None
         return cls(
-            bundle.floor_plan,
-            geometry.materials,
+            bundle.surroundings,
+            bundle.surfaces,
             speed_of_sound=manifest.speed_of_sound,
             air_db_per_m=manifest.air.filter_db_per_m,
             filters=filters,

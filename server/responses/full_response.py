@@ -12,7 +12,6 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power
 from server.acoustics.geometry import Pose, Quaternion, orientations_of
-from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.hrtf import HeadFilters, kemar
@@ -33,7 +32,7 @@ class FullResponse:
         self.field = field.through(filters)
         self._filters = filters
         self._air_db_per_m = manifest.air.absorption_db_per_m
-        self._paths = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
+        self._paths = field.bundle.surroundings.sound_paths(manifest.speed_of_sound)
         self._direct = StillPaths(
             filters, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m
         )

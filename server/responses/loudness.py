@@ -112,7 +112,7 @@ def loudness_map(
     x = centre[0] + (np.arange(columns) - (columns - 1) / 2) * spacing_m
     y = centre[1] + (np.arange(rows) - (rows - 1) / 2) * spacing_m
     cells = np.stack([*np.meshgrid(x, y), np.full((rows, columns), listener_height_m)], axis=-1)
-    inside = bundle.floor_plan.contains(cells)
+    inside = bundle.surroundings.contains(cells)
     levels = np.full((rows, columns), np.nan)
     listeners = cells[inside]
     whole = np.empty(len(listeners))

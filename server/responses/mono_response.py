@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import Pose, Quaternion, orientations_of
-from server.acoustics.sound_path import SoundPathFinder
 from server.field.field import AcousticField
 from server.rendering.hrtf import NoHead
 from server.rendering.still_paths import StillPaths
@@ -38,7 +37,7 @@ def mono_responses(
     if manifest.direct_sound == "field":
         return responses
     no_head = NoHead(field.sample_rate)
-    finder = SoundPathFinder(field.bundle.floor_plan, manifest.speed_of_sound)
+    finder = field.bundle.surroundings.sound_paths(manifest.speed_of_sound)
     waves = StillPaths(no_head, speed_of_sound=manifest.speed_of_sound, air_db_per_m=manifest.air.filter_db_per_m)
     early = EarlyReflections.of(field.bundle, no_head)
     for response, listener, emitter, orientation in zip(

@@ -21,9 +21,11 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
+from server.acoustics.surroundings import PlanSurroundings, Surroundings
 from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
+from server.scene.geometry import Material
 from server.scene.manifest import ARRAYS_FILE, Manifest
 
 MANIFEST_FILE = "scene.json"
@@ -86,6 +88,16 @@ class Bundle:
     def floor_plan(self) -> FloorPlan:
         return self.manifest.floor_plan
 
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        """The geometry by which sound is computed."""
+        return PlanSurroundings(self.floor_plan)
+
+    @property
+    def surfaces(self) -> tuple[Material, ...] | None:
+        """The materials of its surfaces, as the geometry numbers them; None if they are unknown."""
+        return None if self.manifest.geometry is None else self.manifest.geometry.materials.surfaces
+
     def require_inside(self, position: Vector3, field: str) -> None:
         """Raises RequestError `position_out_of_bounds` unless the position is finite, within the bounds and not
         inside a wall."""
@@ -93,7 +105,7 @@ class Bundle:
         sides = zip(bounds.minimum, position, bounds.maximum, strict=True)
         # guard: a place is within the bounds
         in_box = all(least <= at <= most for least, at, most in sides)
-        if in_box and self.floor_plan.holds(position):
+        if in_box and self.surroundings.holds(position):
             return
         place = ", ".join(f"{coordinate:g}" for coordinate in position)
         problem = "is inside a wall" if in_box else f"is outside {list(bounds.minimum)} to {list(bounds.maximum)} m"

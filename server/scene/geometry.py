@@ -41,6 +41,11 @@ class Materials(Strict):
     floor: Material
     ceiling: Material
 
+    @property
+    def surfaces(self) -> tuple[Material, ...]:
+        """The materials in the order in which surfaces of a floor plan are numbered."""
+        return self.walls, self.floor, self.ceiling
+
 
 class Opening(Strict):
     """A passage between rooms, given by the line on the floor over which one steps."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_reflections import MOST_REFLECTIONS, MeshReflectionFinder, TransmissionLoss, patches_of
+from server.acoustics.mesh_reflections import MOST_REFLECTIONS, MeshReflectionFinder, MeshWallLosses, patches_of
 from server.acoustics.mesh_tree import MeshTree
 from server.acoustics.reflections import ReflectionFinder
 from server.acoustics.transmission import walls_between
@@ -146,8 +146,12 @@ def test_of_too_many_mirrors_the_largest_are_found():
 
 def test_transmission_takes_what_the_walls_of_a_plan_take():
     plan = APARTMENT.floor_plan
-    loss = TransmissionLoss(MeshTree(MeshGeometry.of_plan(APARTMENT).mesh), GAINS_DB * -1)
-    a, b = points_inside(plan, 200, 3), points_inside(plan, 200, 4)
-    found = loss.between(a, b)
-    np.testing.assert_allclose(found, walls_between(plan, a, b)[:, None] * -GAINS_DB[0])
-    assert 0 < np.count_nonzero(found[:, 0]) < 200
+    tree = MeshTree(MeshGeometry.of_plan(APARTMENT).mesh)
+    listener, emitters = points_inside(plan, 1, 3)[0], points_inside(plan, 200, 4)
+    through, losses_db = MeshWallLosses(tree, GAINS_DB * -1).between(listener, emitters)
+    walls = walls_between(plan, listener, emitters)
+    np.testing.assert_array_equal(through, walls > 0)
+    np.testing.assert_allclose(losses_db, walls[:, None] * -GAINS_DB[0])
+    assert 0 < np.count_nonzero(through) < 200
+    solid = np.where(np.arange(3)[:, None] == 0, np.inf, -GAINS_DB)
+    assert not MeshWallLosses(tree, solid).between(listener, emitters)[0].any()

@@ -210,7 +210,7 @@ def test_compiled_and_numpy_reflections_are_the_same(name):
 @pytest.mark.parametrize("name", PLANS)
 def test_no_reflection_comes_before_the_first_echo(name):
     plan, finder = PLANS[name], FINDERS[name]
-    echo = FirstEcho(plan)
+    echo = FirstEcho.of_plan(plan)
     margins = []
     for listener, emitter in pairs(plan, 200, 11):
         earliest = float(echo.length_m(listener[None], emitter[None])[0])
@@ -225,9 +225,9 @@ def test_no_reflection_comes_before_the_first_echo(name):
 def test_the_first_echo_of_a_box_is_its_nearest_image():
     listeners, emitters = points_inside(BOX, 50, 3), points_inside(BOX, 50, 4)
     nearest = [one(FINDERS["box"], *pair).length_m.min() for pair in zip(listeners, emitters, strict=True)]
-    np.testing.assert_allclose(FirstEcho(BOX).length_m(listeners, emitters), nearest)
+    np.testing.assert_allclose(FirstEcho.of_plan(BOX).length_m(listeners, emitters), nearest)
 
 
 def test_on_a_surface_the_echo_is_there_at_once():
     ends = np.array([[1.0, 2.0, 0.0]]), np.array([[4.0, 1.0, 1.2]])
-    np.testing.assert_allclose(FirstEcho(BOX).length_m(*ends), np.linalg.norm(ends[0] - ends[1], axis=-1))
+    np.testing.assert_allclose(FirstEcho.of_plan(BOX).length_m(*ends), np.linalg.norm(ends[0] - ends[1], axis=-1))

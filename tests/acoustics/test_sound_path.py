@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import DescribedPaths, SoundPathFinder, SoundPaths
+from server.acoustics.sound_path import DescribedPaths, PlanPathFinder, SoundPathFinder, SoundPaths
 from tests.oracles.sound_path import NumpySoundPathFinder, diffraction_gain_db
 
 Floats = npt.NDArray[np.float64]
@@ -45,7 +45,7 @@ SERPENTINE = FloorPlan(
 )
 BOX = FloorPlan(((0, 0), (5, 0), (5, 4), (0, 4)), 2.5)
 PLANS = {"apartment": APARTMENT, "serpentine": SERPENTINE, "star": star(33), "box": BOX}
-FINDERS = {name: SoundPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
+FINDERS = {name: PlanPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
 FINDER = FINDERS["apartment"]
 ORACLES = {name: NumpySoundPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
 
@@ -334,7 +334,7 @@ def test_compiled_and_numpy_paths_are_the_same(name: str) -> None:
 @settings(max_examples=30)
 def test_in_any_room_the_shortest_path_is_found_whichever_way_it_is_computed(seed: int) -> None:
     plan = star(seed)
-    finder = SoundPathFinder(plan, SPEED_OF_SOUND)
+    finder = PlanPathFinder(plan, SPEED_OF_SOUND)
     listener, *emitters = points_inside(plan, 9, seed)
     paths = finder.find(listener, np.array(emitters))
     np.testing.assert_allclose(paths.length_m, plan.path_length_m(listener, np.array(emitters)), rtol=1e-12)
@@ -376,7 +376,7 @@ def test_no_step_of_a_millimetre_changes_told_sight_by_much() -> None:
     across = np.linspace(2.1, 4.5, 2401)
     listeners = np.column_stack([np.full_like(across, 1.0), across, np.full_like(across, 1.5)])
     emitters = np.tile([5.0, 1.0, 1.5], (len(across), 1))
-    sight = SoundPathFinder(plan, SPEED_OF_SOUND).describe(listeners, emitters).described[:, 1]
+    sight = PlanPathFinder(plan, SPEED_OF_SOUND).describe(listeners, emitters).described[:, 1]
     assert sight.min() < 0.1
     assert sight.max() == 1
     assert np.abs(np.diff(sight)).max() < 0.02
@@ -386,7 +386,7 @@ def test_told_directions_are_those_in_which_the_paths_leave_both_ends(
     told: tuple[FloorPlan, Floats, Floats, DescribedPaths],
 ) -> None:
     plan, listeners, emitters, paths = told
-    finder = SoundPathFinder(plan, SPEED_OF_SOUND)
+    finder = PlanPathFinder(plan, SPEED_OF_SOUND)
     for row, (listener, emitter) in enumerate(zip(listeners, emitters, strict=True)):
         found = one(finder, listener, emitter)
         for direction, told_so in ((found.arrival[0], 2), (found.departure[0], 4)):
@@ -403,14 +403,14 @@ def test_compiled_and_numpy_paths_are_told_the_same(told: tuple[FloorPlan, Float
 
 def test_told_paths_there_and_back_are_one(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
     plan, listeners, emitters, paths = told
-    back = SoundPathFinder(plan, SPEED_OF_SOUND).describe(emitters, listeners)
+    back = PlanPathFinder(plan, SPEED_OF_SOUND).describe(emitters, listeners)
     np.testing.assert_allclose(back.described[:, [0, 1, 4, 5, 2, 3]], paths.described, atol=1e-5)
 
 
 def test_each_pair_is_told_as_if_it_were_alone(told: tuple[FloorPlan, Floats, Floats, DescribedPaths]) -> None:
     """Pairs with one listener share work."""
     plan, listeners, emitters, _ = told
-    finder = SoundPathFinder(plan, SPEED_OF_SOUND)
+    finder = PlanPathFinder(plan, SPEED_OF_SOUND)
     listeners = np.repeat(listeners[:30], 4, axis=0)
     together = finder.describe(listeners, emitters[:120])
     alone = [finder.describe(listeners[row : row + 1], emitters[row : row + 1]).described for row in range(120)]

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import butter, sosfilt
 
 from server.acoustics.geometry import Quaternion
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.acoustics.spherical_harmonics import real_harmonics
 from server.field.band_tail import early_frames
 from server.field.directional_graph import DirectionalGraph
@@ -32,7 +32,7 @@ class _Predicted(DirectionalGraph):
     def __init__(self, log_magnitude, relative) -> None:
         self.name, self.channels, self.gives_responses = "predicted", 2, False
         self.order = self.heard_order = 2
-        self.parameters, self.paths = PARAMETERS, SoundPathFinder(APARTMENT.floor_plan, 343.0)
+        self.parameters, self.paths = PARAMETERS, PlanPathFinder(APARTMENT.floor_plan, 343.0)
         self.said = log_magnitude, relative
 
     def run(self, listeners, emitters, heads, paths=None):  # noqa: ARG002  the same everywhere

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from server.acoustics.geometry import Pose
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.field.lattice import Lattice, delay_response
 from server.scene.bundle import Bundle, find_bundle
 from server.scene.manifest import Manifest, Reuse
@@ -17,7 +17,7 @@ from server.scene.manifest import Manifest, Reuse
 MANIFEST = Manifest.model_validate_json((find_bundle("apartment") / "scene.json").read_text())
 BUNDLE = Bundle(Path(), MANIFEST, "", {}, np.zeros((2, 1), np.float32))
 PLAN, LOW, HIGH = BUNDLE.floor_plan, np.array(MANIFEST.bounds.minimum), np.array(MANIFEST.bounds.maximum)
-PATHS = SoundPathFinder(PLAN, MANIFEST.speed_of_sound)
+PATHS = PlanPathFinder(PLAN, MANIFEST.speed_of_sound)
 SPACINGS_M = (0.1, 0.35, 1.0, 2.5, 20.0)
 
 places = st.tuples(*(st.floats(low, high, allow_subnormal=False) for low, high in zip(LOW, HIGH, strict=True)))

@@ -11,7 +11,7 @@ from onnx import helper, numpy_helper
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.field.graph import INPUTS, OUTPUTS, PATH
 from server.field.runtime import open_session
 from training.bundling.graphs import to_int8, to_onnx
@@ -59,7 +59,7 @@ def scattered(count):
 
 def told(listeners, emitters, yaws):
     """Poses as the graph's inputs."""
-    paths = SoundPathFinder(PLAN, 343.0).describe(listeners, emitters).described
+    paths = PlanPathFinder(PLAN, 343.0).describe(listeners, emitters).described
     return [part.astype(np.float32) for part in (listeners, emitters, yaws, paths)]
 
 

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.core.errors import FieldError
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -124,7 +124,7 @@ def test_orientation_weights_sum_to_one_at_every_heading(yaw, measured):
 
 @pytest.mark.parametrize("place", [(4.0, 2.5, 1.5), (0.0, 0.0, 0.0), (8.0, 5.0, 2.8), (1e6, 1e6, 1.0)])
 def test_directions_to_an_emitter_in_the_listeners_head_are_finite(place):
-    path = SoundPathFinder(PLAN, 343.0).describe([place], [place])
+    path = PlanPathFinder(PLAN, 343.0).describe([place], [place])
     assert np.isfinite(path.described).all()
     assert np.abs(path.described).max() <= 1.0
 

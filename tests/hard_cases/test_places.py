@@ -13,7 +13,7 @@ from server.acoustics.air import absorption_db_per_m
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, HYPERCARDIOID, OMNIDIRECTIONAL, Cardioid
 from server.acoustics.geometry import FARTHEST_M, FloorPlan, Pose
 from server.acoustics.reflections import ReflectionFinder
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.core.errors import RequestError
 from server.protocol.client_messages import ListenerPose, MoveEmitter
 from server.rendering.direct_path import PathTarget
@@ -49,7 +49,7 @@ LISTENER = (1.0, 5.0, 1.5)
 def paths(plan, listener, emitter):
     """By compiled code and by NumPy."""
     listener, emitters = np.asarray(listener, float), np.asarray([emitter], float)
-    return tuple(kind(plan, 343.0).find(listener, emitters) for kind in (SoundPathFinder, NumpySoundPathFinder))
+    return tuple(kind(plan, 343.0).find(listener, emitters) for kind in (PlanPathFinder, NumpySoundPathFinder))
 
 
 @pytest.mark.parametrize("place", SPECIAL.values(), ids=SPECIAL)

@@ -8,6 +8,7 @@ from scipy.signal import fftconvolve
 
 from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, OMNIDIRECTIONAL
 from server.acoustics.geometry import FloorPlan, Pose, yaws_of
+from server.acoustics.surroundings import PlanSurroundings
 from server.field.fields_by_level import FieldsByLevel
 from server.field.kinds.catalogue import kind_of
 from server.offline.render import PathError, PathPoint, RenderedEmitter, read_path, render
@@ -61,7 +62,7 @@ FIELD, DEAD = NoiseField(), DeadField()
 def open_hall(filters):
     """A hall in which everyone sees everyone."""
     plan = FloorPlan(((0.0, 0.0), (40.0, 0.0), (40.0, 20.0), (0.0, 20.0)), 5.0)
-    return DirectSound(plan, speed_of_sound=SPEED_OF_SOUND, air_db_per_m=np.zeros(7), filters=filters)
+    return DirectSound(PlanSurroundings(plan), speed_of_sound=SPEED_OF_SOUND, air_db_per_m=np.zeros(7), filters=filters)
 
 
 def noise(seed, samples):

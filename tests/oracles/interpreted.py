@@ -53,7 +53,7 @@ def _find_paths_by_numpy() -> None:
     from server.acoustics import reflections, sound_path
 
     reflections.ReflectionFinder = NumpyReflectionFinder  # type: ignore[assignment,misc]
-    sound_path.SoundPathFinder = NumpySoundPathFinder  # type: ignore[assignment,misc]
+    sound_path.PlanPathFinder = NumpySoundPathFinder  # type: ignore[assignment,misc]
 
 
 def _render_by_numpy() -> None:

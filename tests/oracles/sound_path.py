@@ -25,7 +25,7 @@ def diffraction_gain_db(fresnel_number: npt.ArrayLike) -> Floats:
 
 
 class NumpySoundPathFinder:
-    """See `server.acoustics.sound_path.SoundPathFinder`."""
+    """See `server.acoustics.sound_path.PlanPathFinder`."""
 
     def __init__(self, plan: FloorPlan, speed_of_sound: float) -> None:
         self._plan = plan

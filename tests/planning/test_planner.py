@@ -9,13 +9,14 @@ from server.acoustics.air import absorption_db_per_m
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
+from server.acoustics.surroundings import PlanSurroundings
 from server.core.errors import RequestError
 from server.planning.catalogue import CATALOGUE
 from server.planning.cost import Cost
 from server.planning.planner import THRESHOLD, make_plan
 from server.planning.scene_acoustics import Emitter, Listener, Reverberation, SceneAcoustics, Situation
 from server.scene.effects import EffectName, read_overrides
-from server.scene.geometry import Material, Materials
+from server.scene.geometry import Material
 
 BANDS = len(OCTAVE_BANDS_HZ)
 AIR = absorption_db_per_m(OCTAVE_BANDS_HZ)
@@ -36,12 +37,12 @@ ROOM = replace(
     OPEN,
     minimum=(0.2, 0.2, 0.5),
     maximum=(5.8, 4.8, 2.0),
-    plan=BOX,
-    materials=Materials(walls=PLASTER, floor=PLASTER, ceiling=PLASTER),
+    surroundings=PlanSurroundings(BOX),
+    surfaces=(PLASTER, PLASTER, PLASTER),
     reverberation=LIVELY,
 )
 DRY = replace(LIVELY, energy=np.full(BANDS, 0.01))
-CORNER = replace(ROOM, plan=ELL, maximum=(7.8, 7.8, 2.0), reverberation=DRY)
+CORNER = replace(ROOM, surroundings=PlanSurroundings(ELL), maximum=(7.8, 7.8, 2.0), reverberation=DRY)
 
 
 def at(x: float, y: float = 1.0, **more) -> Emitter:
@@ -137,8 +138,7 @@ def test_through_a_light_wall_sound_is_heard_with_the_first_reflections():
 
     def change(mass: float, *, transmits: bool) -> float:
         walls = dead.model_copy(update={"surface_mass_kg_m2": mass})
-        materials = Materials(walls=walls, floor=dead, ceiling=dead)
-        place = replace(CORNER, materials=materials, transmits=transmits, reverberation=DRY)
+        place = replace(CORNER, surfaces=(walls, dead, dead), transmits=transmits, reverberation=DRY)
         plan = make_plan(situation(place, hidden["emitter"], stands=hidden["stands"]))
         return plan.about(EffectName.EARLY_REFLECTIONS, "0")[0].change_jnd
 
@@ -215,7 +215,7 @@ def test_a_direct_sound_buried_in_reverberation_is_not_called_for_nor_anything_a
 
 
 def test_where_the_field_holds_the_direct_sound_nothing_is_computed_of_it():
-    measured = replace(ROOM, plan=None, materials=None, holds_direct_sound=True)
+    measured = replace(ROOM, surroundings=None, surfaces=None, holds_direct_sound=True)
     assert on(make_plan(situation(measured, at(4, speed_m_s=1), turns=True))) == {
         EffectName.LATE_REVERBERATION,
         EffectName.HRTF,

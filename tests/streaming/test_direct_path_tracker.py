@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from server.acoustics.directivity import CARDIOID
 from server.acoustics.geometry import FloorPlan, Pose
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
+from server.acoustics.surroundings import PlanSurroundings
 from server.rendering.hrtf import NoHead
 from server.responses.direct_sound import DirectSound
 from server.responses.effect_flags import ALL_ON
@@ -36,7 +37,7 @@ class Paths:
 
 @pytest.fixture(scope="module")
 def sound():
-    return DirectSound(CORNER, speed_of_sound=343.0, air_db_per_m=np.zeros(7), filters=NoHead(48_000))
+    return DirectSound(PlanSurroundings(CORNER), speed_of_sound=343.0, air_db_per_m=np.zeros(7), filters=NoHead(48_000))
 
 
 def emitters_at(*places):
@@ -101,7 +102,7 @@ def test_only_what_has_moved_is_aimed_at(sound):
 
 
 def test_nothing_is_aimed_where_fields_hold_the_direct_sound():
-    whole = DirectSound(CORNER, speed_of_sound=343.0, air_db_per_m=np.zeros(7), filters=None)
+    whole = DirectSound(PlanSurroundings(CORNER), speed_of_sound=343.0, air_db_per_m=np.zeros(7), filters=None)
     paths = Paths()
     DirectPathTracker(whole, paths, emitters_at(*PLACES)).follow(Pose(PLACES[0]))
     assert paths.asked == 0
@@ -122,7 +123,7 @@ def test_a_gain_that_is_handed_over_is_of_those_alone_whose_effects_have_it(soun
         return paths.find(Pose((7.5, 0.5, 1.5))).gain_db.copy()
 
     plain, changed = found_db(), found_db("2", "3")
-    paths = SoundPathFinder(CORNER, 343.0).find(np.array((7.5, 0.5, 1.5)), np.array(PLACES))
+    paths = PlanPathFinder(CORNER, 343.0).find(np.array((7.5, 0.5, 1.5)), np.array(PLACES))
     assert paths.screen_db[2].min() < -10
     expected = gain_db(paths)
     np.testing.assert_array_equal(changed[[0, 1, 4]], plain[[0, 1, 4]])

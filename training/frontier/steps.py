@@ -41,7 +41,7 @@ def largest_steps(field: AcousticField, *, count: int, seed: int) -> dict[str, f
         before, after = (measure(_response(whole, pose), field.sample_rate) for pose in steps[number])
         errors = parameter_errors(before, after)
         places = np.array([pose.position for pose in steps[number]])
-        if not np.all(field.bundle.floor_plan.is_visible(places, np.array(emitter))):
+        if not np.all(field.bundle.surroundings.is_visible(places, np.array(emitter))):
             del errors["drr"]
         for metric, change in in_jnd(errors, before).items():
             if np.isfinite(change):

@@ -52,7 +52,7 @@ def _places(bundle: Bundle, rng: np.random.Generator) -> Iterator[_Floats]:
         yield at
         while True:
             place = rng.uniform(low, high)
-            if bundle.floor_plan.contains(place) and bundle.floor_plan.is_visible(at, place):
+            if bundle.surroundings.contains(place) and bundle.surroundings.is_visible(at, place):
                 break
         at = place
 

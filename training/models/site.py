@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder, SoundPathFinder
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.responses import ResponseSet
 from training.simulation.responses import SimulatedResponses
@@ -54,7 +54,7 @@ class Site:
 
     @cached_property
     def _finder(self) -> SoundPathFinder:
-        return SoundPathFinder(self.plan, SPEED_OF_SOUND)
+        return PlanPathFinder(self.plan, SPEED_OF_SOUND)
 
     def paths(self, listeners: npt.NDArray[np.floating], emitters: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """Describe the shortest paths of pairs, (B, 3) and (B, 3), as a field is told of them."""

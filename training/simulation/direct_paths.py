@@ -12,7 +12,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_amplitude
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder, SoundPathFinder
 from server.acoustics.transmission import transmission_loss_db, walls_between
 from server.scene.manifest import Air
 from training.data.dataset import SPEED_OF_SOUND
@@ -40,7 +40,7 @@ class DirectPaths:
         return cls(
             floor_plan,
             scene.air if plan.air_absorption else None,
-            SoundPathFinder(floor_plan, SPEED_OF_SOUND) if plan.diffraction else None,
+            PlanPathFinder(floor_plan, SPEED_OF_SOUND) if plan.diffraction else None,
             transmission_loss_db(mass, OCTAVE_BANDS_HZ) if plan.transmission and mass is not None else None,
         )
 

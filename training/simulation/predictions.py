@@ -15,7 +15,7 @@ from server.acoustics.audibility import JND_THRESHOLDS
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import SoundPathFinder, SoundPaths
+from server.acoustics.sound_path import PlanPathFinder, SoundPaths
 from server.acoustics.transmission import transmission_loss_db, walls_between
 from server.planning.change import Change
 from server.scene.limits import MOST_SAMPLES
@@ -273,7 +273,7 @@ class Predictions:
     @cached_property
     def _paths(self) -> SoundPaths:
         """(pair,) paths of the direct sound in the order of `_pairs`."""
-        finder, (first, second) = SoundPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
+        finder, (first, second) = PlanPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
         found = [finder.find(self.probes[at], self.probes[second[first == at]]) for at in np.unique(first)]
         return SoundPaths(
             *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in found), strict=True))

@@ -128,7 +128,7 @@ def _queries(bundle: Bundle, pairs: int, seed: int) -> Iterator[IrQuery]:
     while pairs:
         listener, emitter = (tuple(rng.uniform(bounds.minimum, bounds.maximum).tolist()) for _ in range(2))
         if (
-            not bundle.floor_plan.contains(np.array([listener, emitter])).all()
+            not bundle.surroundings.contains(np.array([listener, emitter])).all()
             or np.linalg.norm(np.subtract(listener, emitter)) < 1
         ):
             continue

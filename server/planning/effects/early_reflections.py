@@ -9,7 +9,7 @@ from server.scene.effects import EffectName
 
 def _absence(situation: Situation, _: Emitter | None) -> str:
     place = situation.place
-    if place.plan is None and place.reverberation is None:
+    if place.surroundings is None and place.reverberation is None:
         return "there is nothing to reflect"
     return "the field's responses hold them" if place.reflections is None else ""
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from server.acoustics.sound_path import SoundPathFinder
 from server.planning.effect import DIRECT_SOUND, ENERGIES, EnergyEffect
 from server.planning.reasons import nothing_in_the_way
 from server.scene.bundle import Bundle
@@ -13,7 +12,7 @@ from server.scene.effects import EffectName
 
 def _find_paths(bundle: Bundle, emitters: int) -> Callable[[], object]:
     start = bundle.manifest.start
-    finder = SoundPathFinder(bundle.floor_plan, bundle.manifest.speed_of_sound)
+    finder = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
     listener, places = np.array(start.listener), np.tile(start.emitter, (emitters, 1))
     return lambda: finder.find(listener, places)
 

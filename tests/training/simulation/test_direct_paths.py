@@ -5,7 +5,7 @@ import pytest
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import amplitude_to_db
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import PlanPathFinder
 from server.acoustics.transmission import transmission_loss_db
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulationPlan
@@ -29,7 +29,7 @@ def scene_with(tiny_scene, mass=None):
 def test_it_comes_as_late_from_where_and_as_loud_as_rendering_has_it(tiny_scene, listener):
     scene = scene_with(tiny_scene)
     (position,), (amplitude,) = DirectPaths.of(scene, BENT).images(HERE, listener)
-    paths = SoundPathFinder(scene.geometry.floor_plan, 343.0).find(listener, HERE[None])
+    paths = PlanPathFinder(scene.geometry.floor_plan, 343.0).find(listener, HERE[None])
     np.testing.assert_allclose(position - listener, paths.length_m[0] * paths.arrival[0], atol=1e-9)
     air_db = paths.length_m[0] * scene.air.absorption_db_per_m
     expected_db = paths.screen_db[0] - air_db - amplitude_to_db(paths.length_m[0])

@@ -13,6 +13,7 @@ import pytest
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import Pose
 from server.acoustics.room_parameters import measure
+from server.acoustics.surroundings import PlanSurroundings
 from server.field.field import AcousticField
 from server.offline.render import RenderedEmitter
 from server.rendering.hrtf import kemar
@@ -118,8 +119,8 @@ def direct_paths(pair, air):
 def first_reflections(pair, scene):
     """(yaw, ear, sample) by the code of the server."""
     early = EarlyReflections(
-        scene.geometry.floor_plan,
-        scene.geometry.materials,
+        PlanSurroundings(scene.geometry.floor_plan),
+        scene.geometry.materials.surfaces,
         speed_of_sound=SPEED_OF_SOUND,
         air_db_per_m=scene.air.absorption_db_per_m,
         filters=kemar(RATE),
@@ -206,8 +207,8 @@ def test_what_goes_through_a_wall_is_the_simulations(apartment):
     heard = []
     for transmission in (False, True):
         early = EarlyReflections(
-            scene.geometry.floor_plan,
-            materials,
+            PlanSurroundings(scene.geometry.floor_plan),
+            materials.surfaces,
             speed_of_sound=SPEED_OF_SOUND,
             air_db_per_m=scene.air.absorption_db_per_m,
             filters=kemar(RATE),

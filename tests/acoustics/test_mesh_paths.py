@@ -1,0 +1,258 @@
+"""Shortest paths in meshes: against the same floor plans, against screens and openings whose paths are known, and
+against paths over points strewn along the edges."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from server.acoustics.bands import OCTAVE_BANDS_HZ
+from server.acoustics.diffraction import diffraction_gain_db
+from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_edges import MOST_POINTS, bends_of
+from server.acoustics.mesh_paths import MeshPathFinder
+from server.acoustics.mesh_tree import MeshTree
+from server.acoustics.sound_path import PlanPathFinder
+from server.scene.mesh_geometry import MeshGeometry
+from training.data.scene_file import SceneFile
+
+SCENES = Path(__file__).resolve().parents[2] / "training" / "scenes"
+SPEED = 343.0
+QUADS = ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5))
+CUBE = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+OF_AIR = np.array([(q[0], q[a], q[a + 1]) for q in QUADS for a in (1, 2)])
+OF_SOLID = OF_AIR[:, ::-1]
+ROOM = (CUBE * (10, 8, 3), OF_AIR)
+TURN, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))
+
+
+def mesh_of(*parts):
+    """Parts are (vertices, triangles)."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    triangles = np.concatenate([np.asarray(faces) + at for (_, faces), at in zip(parts, starts, strict=False)])
+    return TriangleMesh(np.concatenate([part for part, _ in parts]), triangles, np.zeros(len(triangles), int), ("all",))
+
+
+def finder_of(*parts):
+    return MeshPathFinder(MeshTree(mesh_of(*parts)), SPEED)
+
+
+def sheet(*corners):
+    return np.array(corners, dtype=float), np.array([(0, 1, 2), (0, 2, 3)])
+
+
+def block(low, high):
+    return CUBE * np.subtract(high, low) + low, OF_SOLID
+
+
+def points_inside(plan, count, seed):
+    corners = np.array(plan.corners)
+    low, high = (*corners.min(axis=0), 0.1), (*corners.max(axis=0), plan.height_m - 0.1)
+    points = np.random.default_rng(seed).uniform(low, high, (60 * count, 3))
+    return points[plan.contains(points) & (plan.wall_distance_m(points) >= 0.02)][:count]
+
+
+@pytest.mark.parametrize("name", ["apartment", "medium1", "medium2", "small1"])
+def test_a_plan_as_a_mesh_leads_sound_as_the_plan(name):
+    geometry = SceneFile.read(SCENES / f"{name}.toml").geometry
+    plan = geometry.floor_plan
+    mesh, expected = MeshPathFinder(MeshTree(MeshGeometry.of_plan(geometry).mesh), SPEED), PlanPathFinder(plan, SPEED)
+    emitters = points_inside(plan, 100, 1)
+    off_m, hidden = [], 0
+    for listener in points_inside(plan, 30, 2):
+        found, wanted = mesh.find(listener, emitters), expected.find(listener, emitters)
+        np.testing.assert_array_equal(found.in_sight, wanted.in_sight)
+        same = np.abs(found.length_m - wanted.length_m) < 1e-4
+        np.testing.assert_allclose(found.screen_db[same], wanted.screen_db[same], atol=0.02)
+        np.testing.assert_allclose(found.arrival[same], wanted.arrival[same], atol=0.02)
+        np.testing.assert_allclose(found.departure[same], wanted.departure[same], atol=0.02)
+        off_m.append(np.abs(found.length_m - wanted.length_m))
+        hidden += np.count_nonzero(~wanted.in_sight)
+    # Where two ways are nearly as long, that over the points may be the longer one by the points' distances.
+    assert np.mean(np.concatenate(off_m) > 1e-4) < 0.005
+    assert np.max(off_m) < 0.05
+    assert (hidden > 100) == (name != "small1")
+
+
+def test_over_a_screen_sound_is_screened_by_its_detour():
+    """A wall across the room, 1.5 m high: the shortest path crosses its upper edge by the law of the unfolded plane."""
+    finder = finder_of(ROOM, sheet((5, 0, 0), (5, 8, 0), (5, 8, 1.5), (5, 0, 1.5)))
+    listener, emitter = np.array([3.0, 2.0, 1.0]), np.array([8.0, 5.0, 0.5])
+    paths = finder.find(listener, emitter[None])
+    across = np.hypot(2.0, 0.5) + np.hypot(3.0, 1.0)
+    length = np.hypot(across, 3.0)
+    assert not paths.in_sight[0]
+    assert paths.length_m[0] == pytest.approx(length, abs=1e-6)
+    straight = np.linalg.norm(emitter - listener)
+    assert paths.excess_m[0] == pytest.approx(length - straight, abs=1e-6)
+    expected = [diffraction_gain_db(2 * (length - straight) * hz / SPEED) for hz in OCTAVE_BANDS_HZ]
+    np.testing.assert_allclose(paths.screen_db[0], expected, atol=1e-3)
+    spot = np.array([5.0, 2.0 + 3.0 * np.hypot(2.0, 0.5) / across, 1.5])
+    np.testing.assert_allclose(paths.arrival[0], (spot - listener) / np.linalg.norm(spot - listener), atol=1e-5)
+    np.testing.assert_allclose(paths.departure[0], (spot - emitter) / np.linalg.norm(spot - emitter), atol=1e-5)
+
+
+def test_through_a_window_the_shortest_of_all_ways_is_taken():
+    """A wall across the room with a window, against points strewn all along the window's edges."""
+    low, high = np.array([3.0, 1.0]), np.array([4.5, 2.0])
+    wall = [
+        sheet((5, 0, 0), (5, low[0], 0), (5, low[0], 3), (5, 0, 3)),
+        sheet((5, high[0], 0), (5, 8, 0), (5, 8, 3), (5, high[0], 3)),
+        sheet((5, low[0], 0), (5, high[0], 0), (5, high[0], low[1]), (5, low[0], low[1])),
+        sheet((5, low[0], high[1]), (5, high[0], high[1]), (5, high[0], 3), (5, low[0], 3)),
+    ]
+    finder = finder_of(ROOM, *wall)
+    share = np.linspace(0, 1, 4001)[:, None]
+    frame = [(low, (low[0], high[1])), ((low[0], high[1]), high), (high, (high[0], low[1])), ((high[0], low[1]), low)]
+    spots = np.concatenate([np.array(a) + share * np.subtract(b, a) for a, b in frame])
+    spots = np.column_stack([np.full(len(spots), 5.0), spots])
+    rng, hidden = np.random.default_rng(1), 0
+    for listener, emitter in zip(
+        rng.uniform((0.2, 0.2, 0.2), (4.8, 7.8, 2.8), (60, 3)),
+        rng.uniform((5.2, 0.2, 0.2), (9.8, 7.8, 2.8), (60, 3)),
+        strict=True,
+    ):
+        paths = finder.find(listener, emitter[None])
+        at = (listener + (emitter - listener) * (5 - listener[0]) / (emitter[0] - listener[0]))[1:]
+        assert paths.in_sight[0] == bool(np.all((at > low) & (at < high)))
+        if not paths.in_sight[0]:
+            ways = np.linalg.norm(spots - listener, axis=-1) + np.linalg.norm(spots - emitter, axis=-1)
+            assert paths.length_m[0] == pytest.approx(ways.min(), abs=2e-3)
+            hidden += 1
+    assert hidden > 40
+
+
+def house():
+    """Two floors with a hole between them, a wall with a door, a table and a cupboard, with seams whose pieces have no
+    vertices in common."""
+    return (
+        (CUBE * (8, 6, 5.4), OF_AIR),
+        block((0, 0, 2.5), (8, 4, 2.7)),
+        block((0, 4, 2.5), (5, 6, 2.7)),
+        block((4, 0, 0), (4.2, 2.5, 2.5)),
+        block((4, 3.4, 0), (4.2, 6, 2.5)),
+        block((4, 2.5, 2.05), (4.2, 3.4, 2.5)),
+        block((1.0, 1.0, 0.7), (2.4, 2.0, 0.75)),
+        block((6.5, 0.0, 0.0), (7.5, 0.6, 2.0)),
+    )
+
+
+@pytest.fixture(scope="module")
+def in_house():
+    tree = MeshTree(mesh_of(*house()))
+    points = np.random.default_rng(5).uniform((0.1, 0.1, 0.1), (7.9, 5.9, 5.3), (600, 3))
+    free = tree.contains(points) & (tree.distance_m(points) > 0.05)
+    return MeshPathFinder(tree, SPEED), tree, points[free][:120]
+
+
+def test_every_place_of_a_house_is_reached_the_same_way_back(in_house):
+    finder, _, points = in_house
+    lengths = np.array([finder.find(point, points).length_m for point in points])
+    np.testing.assert_allclose(lengths, lengths.T, atol=0.05)
+    heard = np.array([finder.find(point, points).screen_db[:, 0] for point in points])
+    assert np.all(heard > -60)
+    # No way is longer than one by way of a third place, but for the points at which ways bend.
+    through = np.min(lengths[:, :, None] + lengths[None], axis=1)
+    assert np.mean(lengths > through + 0.01) < 1e-3
+    assert np.all(lengths < through + 0.15)
+
+
+def test_paths_of_a_house_are_not_blocked(in_house):
+    finder, tree, points = in_house
+    for listener in points[:40]:
+        paths = finder.find(listener, points)
+        clear_m = np.minimum(0.3, paths.length_m)[:, None]
+        ends = listener + clear_m * paths.arrival
+        hits = tree.closest(np.broadcast_to(listener, ends.shape), ends - listener, most=0.99)
+        near = np.linalg.norm(ends - listener, axis=-1) * np.where(hits.triangle < 0, 0.0, hits.distance)
+        # The first leg may end at an edge before that.
+        assert np.all((hits.triangle < 0) | (tree.distance_m(listener + near[:, None] * paths.arrival) < 1e-2))
+        assert np.all(paths.length_m >= np.linalg.norm(points - listener, axis=-1) - 1e-9)
+
+
+def test_turned_freely_and_in_single_precision_a_house_leads_sound_as_before(in_house):
+    finder, tree, points = in_house
+    mesh = tree.mesh
+    turned = (mesh.vertices_m @ TURN.T + (3, -2, 1)).astype(np.float32)
+    other = MeshPathFinder(MeshTree(TriangleMesh(turned, mesh.triangles, mesh.surfaces, mesh.materials)), SPEED)
+    off_m = []
+    for listener in points[:30]:
+        found, wanted = (
+            other.find(TURN @ listener + (3, -2, 1), points @ TURN.T + (3, -2, 1)),
+            finder.find(listener, points),
+        )
+        assert np.count_nonzero(found.in_sight != wanted.in_sight) == 0
+        off_m.append(np.abs(found.length_m - wanted.length_m))
+    # Points lie elsewhere along the edges, so that of ways nearly as long another one may be taken.
+    assert np.mean(np.concatenate(off_m) > 0.01) < 0.05
+    assert np.max(off_m) < 0.3
+
+
+def test_no_sound_creeps_under_what_stands_on_the_floor_or_out_of_a_cupboard():
+    room, cupboard = ROOM, block((2, 2, 0), (3, 3, 2))
+    inside = block((2.1, 2.1, 0.1), (2.9, 2.9, 1.9))
+    finder = finder_of(room, cupboard, (inside[0], OF_AIR))
+    paths = finder.find((5, 5, 1.5), np.array([(2.5, 2.5, 1.0), (1.0, 1.0, 0.3)]))
+    assert not paths.in_sight.any()
+    np.testing.assert_array_equal(paths.screen_db[0], -100)
+    assert paths.excess_m[0] == 0
+    assert np.all(paths.screen_db[1] > -40)
+    # Round the cupboard, at the height of the straight line, and not under it.
+    assert paths.excess_m[1] > 0.1
+
+
+def test_a_path_changes_without_a_jump_as_the_emitter_moves(in_house):
+    finder = in_house[0]
+    way = np.linspace((0.4, 0.5, 1.2), (7.6, 5.6, 1.6), 4000)
+    listener = np.array([6.0, 5.0, 4.0])
+    free = in_house[1].contains(way)
+    paths = finder.find(listener, way)
+    step = np.linalg.norm(way[1] - way[0])
+    moves = np.abs(np.diff(paths.length_m))[free[1:] & free[:-1]]
+    assert np.all(moves < step + 0.15)
+    assert np.mean(moves > step + 1e-3) < 0.01
+    gains = np.abs(np.diff(paths.screen_db[:, 2]))[free[1:] & free[:-1]]
+    assert np.max(gains) < 2.0
+
+
+@pytest.mark.parametrize("offset", [0.0, -0.0, 1e-12])
+def test_ends_on_an_edge_at_a_vertex_and_on_each_other_give_finite_paths(in_house, offset):
+    finder = in_house[0]
+    ends = np.array([(4 + offset, 2.5, 1.0), (4 + offset, 2.5, 2.05), (4.1, 2.5, offset), (4.1, 3.0, 2.05), (0, 0, 0)])
+    for listener in ends:
+        paths = finder.find(listener, ends)
+        for value in vars(paths).values():
+            assert np.isfinite(value).all()
+        np.testing.assert_allclose(np.linalg.norm(paths.arrival, axis=-1), 1)
+        assert np.isfinite(finder.describe(np.broadcast_to(listener, ends.shape), ends).described).all()
+
+
+def test_what_describes_a_path_is_what_the_path_says(in_house):
+    finder, _, points = in_house
+    listeners, emitters = points[:40], points[40:80]
+    described = finder.describe(listeners, emitters)
+    for row, (listener, emitter) in enumerate(zip(listeners, emitters, strict=True)):
+        paths = finder.find(listener, emitter[None])
+        assert described.length_m[row] == paths.length_m[0]
+        sight = 1.0 if paths.in_sight[0] else np.exp(-paths.excess_m[0] / 0.05)
+        in_plan = [each[0, :2] / np.linalg.norm(each[0, :2]) for each in (paths.arrival, paths.departure)]
+        np.testing.assert_allclose(
+            described.described[row], (paths.length_m[0], sight, *in_plan[0], *in_plan[1]), atol=1e-3
+        )
+
+
+def test_a_mesh_with_too_many_edges_keeps_the_longest():
+    rng = np.random.default_rng(1)
+    low = rng.uniform((0, 0, 0), (9, 7, 2.5), (150, 3))
+    blocks = [block(at, at + size) for at, size in zip(low, rng.uniform(0.1, 0.4, (150, 3)), strict=True)]
+    bends = bends_of(MeshTree(mesh_of(ROOM, *blocks)))
+    assert 0 < len(bends.places) <= MOST_POINTS
+    assert np.isfinite(bends.lengths).mean() > 0.5
+
+
+def test_a_mesh_without_edges_to_bend_round_has_straight_paths():
+    paths = finder_of(ROOM).find((1, 1, 1), np.array([(9, 7, 2), (1, 1, 1)]))
+    assert paths.in_sight.all()
+    np.testing.assert_array_equal(paths.screen_db, 0)
+    degenerate = TriangleMesh(np.zeros((3, 3)), [(0, 1, 2)], [0], ("all",))
+    assert MeshPathFinder(MeshTree(degenerate), SPEED).find((1, 1, 1), np.ones((1, 3))).in_sight.all()
