@@ -123,6 +123,9 @@ def _listener(channels: Sequence[str], head: str | None, order: int | None) -> s
 def _room(bundle: Bundle) -> tuple[dict[str, str], dict[str, Variable]]:
     """The type of the room, with what the standard asks for of it."""
     manifest = bundle.manifest
+    if bundle.mesh is not None:
+        words = f"a mesh of {len(bundle.mesh.triangles)} triangles, made of {', '.join(bundle.mesh.materials)}"
+        return {"RoomType": "reverberant", "RoomDescription": words}, {}
     if manifest.geometry is None:
         if not manifest.fields:
             return {"RoomType": "free field"}, {}

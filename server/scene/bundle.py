@@ -1,8 +1,8 @@
 """Scene bundles: folders that training writes and the server loads.
 
 `scene.json` describes the scene and lists the SHA-256 of every other file. `*.onnx` are the fields. `arrays.npz` holds
-`frozen_noise` (2, sample), the white signal behind the late reverberation of the scene. A `Bundle` object exists only
-after the whole folder was read and checked.
+`frozen_noise` (2, sample), the white signal behind the late reverberation of the scene. If the place is a mesh, another
+archive holds its arrays. A `Bundle` object exists only after the whole folder was read and checked.
 """
 
 import hashlib
@@ -21,12 +21,13 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from server.acoustics.geometry import FloorPlan, Vector3
-from server.acoustics.surroundings import PlanSurroundings, Surroundings
+from server.acoustics.mesh import MeshError, TriangleMesh
+from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings, Surroundings
 from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
 from server.scene.geometry import Material
-from server.scene.manifest import ARRAYS_FILE, Manifest
+from server.scene.manifest import ARRAYS_FILE, Manifest, SceneMesh
 
 MANIFEST_FILE = "scene.json"
 BUNDLED = Path(__file__).parent / "bundles"
@@ -36,6 +37,8 @@ MOST_MANIFEST_BYTES = 4 * 2**20
 MOST_FILE_BYTES = 2**31 - 1
 """Largest size of all listed files together. A single ONNX file cannot be larger, since protobuf has no larger
 messages."""
+MOST_TRIANGLES = 200_000
+"""The most triangles of a mesh. Paths are looked for in it whenever something moves."""
 _CHUNK_BYTES = 2**20
 _NOISE_MEMBER = "frozen_noise.npy"
 _WIDEST_SAMPLE_BYTES = 8
@@ -48,13 +51,14 @@ _ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.e
 @dataclass(frozen=True)
 class Bundle:
     """A checked scene bundle. `models` holds the bytes of the ONNX files by name. `frozen_noise` (2, sample) is empty
-    if the scene has no fields."""
+    if the scene has no fields. `mesh` is None for a floor plan, and where walls are unknown."""
 
     folder: Path
     manifest: Manifest
     digest: str
     models: dict[str, bytes]
     frozen_noise: npt.NDArray[np.float32]
+    mesh: TriangleMesh | None = None
 
     @classmethod
     def load(cls, folder: Path) -> "Bundle":
@@ -78,7 +82,10 @@ class Bundle:
         if manifest.fields:
             noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
         models = {name: data for name, data in contents.items() if name.endswith(".onnx")}
-        return cls(folder, manifest, hashlib.sha256(text).hexdigest(), models, noise)
+        mesh = None if manifest.mesh is None else _mesh(folder, manifest.mesh, contents[manifest.mesh.file])
+        bundle = cls(folder, manifest, hashlib.sha256(text).hexdigest(), models, noise, mesh)
+        bundle._require_places(path)
+        return bundle
 
     @property
     def id(self) -> str:
@@ -91,12 +98,29 @@ class Bundle:
     @cached_property
     def surroundings(self) -> Surroundings:
         """The geometry by which sound is computed."""
+        if self.mesh is not None and self.manifest.mesh is not None:
+            return MeshSurroundings(self.mesh, open_sky=self.manifest.mesh.open_sky)
         return PlanSurroundings(self.floor_plan)
 
     @property
     def surfaces(self) -> tuple[Material, ...] | None:
         """The materials of its surfaces, as the geometry numbers them; None if they are unknown."""
+        if self.mesh is not None and self.manifest.mesh is not None:
+            return tuple(self.manifest.mesh.materials[name] for name in self.mesh.materials)
         return None if self.manifest.geometry is None else self.manifest.geometry.materials.surfaces
+
+    def _require_places(self, path: Path) -> None:
+        """Raises BundleError if the places that the manifest names do not lie in the air of the mesh. Those in a floor
+        plan are checked with the manifest."""
+        if self.mesh is None:
+            return
+        manifest, (low, high) = self.manifest, self.mesh.bounds_m
+        if np.any(manifest.bounds.minimum < low) or np.any(manifest.bounds.maximum > high):
+            box = " to ".join(str([round(float(side), 3) for side in corner]) for corner in (low, high))
+            raise BundleError(path, "bounds", f"must lie in the box around the mesh, {box}")
+        for name, position in (("listener", manifest.start.listener), ("emitter", manifest.start.emitter)):
+            if not self.surroundings.holds(position):
+                raise BundleError(path, f"start.{name}", "is not in the air: the mesh has it inside a wall or outside")
 
     def require_inside(self, position: Vector3, field: str) -> None:
         """Raises RequestError `position_out_of_bounds` unless the position is finite, within the bounds and not
@@ -154,6 +178,20 @@ def _read_listed(folder: Path, manifest: Manifest) -> dict[str, bytes]:
         contents[name] = _read(folder, name, most, sha256=expected)
         left -= len(contents[name])
     return contents
+
+
+def _mesh(folder: Path, described: SceneMesh, data: bytes) -> TriangleMesh:
+    """The mesh from its archive. Raises BundleError for arrays that are none, and for a material that the manifest does
+    not describe."""
+    try:
+        mesh = TriangleMesh.from_bytes(data, most_triangles=MOST_TRIANGLES, most_vertices=3 * MOST_TRIANGLES)
+    except MeshError as exc:
+        raise BundleError(folder / described.file, "mesh", str(exc)) from exc
+    missing = [name for name in mesh.materials if name not in described.materials]
+    if missing:
+        told = f"{missing[0]!r} is missing, and {described.file} has it: give its absorption and scattering"
+        raise BundleError(folder / MANIFEST_FILE, "mesh.materials", told)
+    return mesh
 
 
 def _noise_bytes(samples: int) -> int:

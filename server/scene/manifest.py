@@ -1,7 +1,8 @@
 """`scene.json`, the manifest of a scene bundle.
 
 A field predicts what arrives at the ears of one head, or what arrives from each direction, from which the server
-computes what any head hears. Only bundles with a field of directions have format 3; all others have format 2.
+computes what any head hears. Bundles with a mesh have format 4; of the others, those with a field of directions have
+format 3, and all the rest have format 2.
 
 The fields of a bundle hold the reflected field only, and the server computes the direct sound from geometry. With
 `image_order` 1 the server also computes the early reflections, and the fields hold only the late reverberation.
@@ -29,9 +30,10 @@ from server.acoustics.bands import FILTER_BANDS_HZ, OCTAVE_BANDS_HZ
 from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.mesh import MOST_MATERIALS
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
 from server.scene.effects import EffectName
-from server.scene.geometry import Finite, Geometry, Point, Strict
+from server.scene.geometry import Finite, Geometry, Material, Point, Strict
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 
 ARRAYS_FILE = "arrays.npz"
@@ -40,6 +42,8 @@ NO_FIELD = "none"
 EARS_FORMAT: Literal[2] = 2
 DIRECTIONS_FORMAT: Literal[3] = 3
 """The format of a bundle with a field that predicts directions."""
+MESH_FORMAT: Literal[4] = 4
+"""The format of a bundle whose surfaces are a mesh."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -55,6 +59,17 @@ class Bounds(Strict):
         if any(low >= high for low, high in zip(self.minimum, self.maximum, strict=True)):
             raise ValueError("minimum must lie below maximum on every axis")
         return self
+
+
+class SceneMesh(Strict):
+    """Surfaces as triangles. `file` is an archive of arrays: `vertices_m` (vertex, 3) float64; `triangles` (triangle,
+    3) int32, counter-clockwise as seen from the air; `surfaces` (triangle,) int32, the number of each triangle's
+    material in `materials`, (material,) names. What these names are made of is in `materials` here. With `open_sky`,
+    the surfaces enclose no air, and sound may leave."""
+
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.npz$")]
+    materials: Annotated[dict[str, Material], Field(min_length=1, max_length=MOST_MATERIALS)]
+    open_sky: bool = False
 
 
 class Start(Strict):
@@ -328,15 +343,17 @@ class AcceptedLaw(Strict):
 class Manifest(Strict):
     """The content of `scene.json`."""
 
-    format_version: Literal[2, 3] = EARS_FORMAT
-    """3 if a field predicts directions, else 2."""
+    format_version: Literal[2, 3, 4] = EARS_FORMAT
+    """4 if there is a mesh, else 3 if a field predicts directions, else 2."""
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     """Identifier by which clients ask for the scene."""
     name: str
     """Name shown on the page."""
     description: str = ""
     geometry: Geometry | None = None
-    """Walls, openings and materials; absent if they are unknown, as of measured places."""
+    """Walls, openings and materials; absent if they are unknown, as of measured places, or given as a mesh."""
+    mesh: SceneMesh | None = None
+    """Surfaces as triangles with their materials, in place of a floor plan."""
     bounds: Bounds
     speed_of_sound: Annotated[float, Field(gt=100, lt=1000)]
     """Metres per second."""
@@ -390,9 +407,10 @@ class Manifest(Strict):
             if field.predicts == "directions" and (field.codec or self.codec).known_frames:
                 raise ValueError(f"fields.{name}.codec.known_frames: must be 0, directions have no phase")
         has_directions = any(field.predicts == "directions" for field in self.fields.values())
-        expected = DIRECTIONS_FORMAT if has_directions else EARS_FORMAT
+        expected = MESH_FORMAT if self.mesh else DIRECTIONS_FORMAT if has_directions else EARS_FORMAT
         if self.format_version != expected:
-            raise ValueError(f"format_version: is {self.format_version}, but fields like these make it {expected}")
+            what = "a mesh makes" if self.mesh else "fields like these make"
+            raise ValueError(f"format_version: is {self.format_version}, but {what} it {expected}")
         if has_directions and (len(self.channels) == 1 or self.direct_sound == "field"):
             raise ValueError("fields: directions are those of late reverberation; the direct sound is from geometry")
         if has_directions and self.image_order == 0:
@@ -445,8 +463,23 @@ class Manifest(Strict):
         return self
 
     @model_validator(mode="after")
+    def _has_a_mesh_or_a_plan(self) -> "Manifest":
+        if self.mesh is None:
+            return self
+        if self.geometry is not None:
+            raise ValueError("mesh: there is a floor plan in geometry too: leave one of them out")
+        if self.mesh.file == ARRAYS_FILE:
+            raise ValueError(f"mesh.file: {ARRAYS_FILE} is for frozen_noise: give the mesh a file of its own")
+        if self.mesh.file not in self.files:
+            raise ValueError(f"mesh.file: {self.mesh.file} is not listed in files")
+        for level in self.levels:
+            if level.reuse is not None:
+                raise ValueError(f"levels.{level.name}.reuse: is for floor plans: leave it out where there is a mesh")
+        return self
+
+    @model_validator(mode="after")
     def _computes_what_can_be_computed(self) -> "Manifest":
-        if self.image_order > 0 and self.geometry is None:
+        if self.image_order > 0 and self.geometry is None and self.mesh is None:
             raise ValueError("image_order: reflections cannot be computed without geometry")
         if self.image_order > 0 and self.direct_sound == "field":
             raise ValueError("image_order: fields that hold the direct sound hold the first reflections too")
@@ -460,11 +493,19 @@ class Manifest(Strict):
 
     @property
     def floor_plan(self) -> FloorPlan:
-        """The floor plan of the geometry or, without one, the empty box of the bounds."""
+        """The floor plan of the geometry or, without one, the empty box of the bounds. Sound in a mesh is not computed
+        by it."""
         if self.geometry is not None:
             return self.geometry.floor_plan
         (west, south, low), (east, north, high) = self.bounds.minimum, self.bounds.maximum
         return FloorPlan(((west, south), (east, south), (east, north), (west, north)), high, low)
+
+    @model_serializer(mode="wrap")
+    def _without_what_format_3_lacks(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if self.mesh is None:
+            document.pop("mesh", None)
+        return document
 
     @model_validator(mode="after")
     def _fits_into_the_room(self) -> "Manifest":

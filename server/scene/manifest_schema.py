@@ -8,7 +8,7 @@ together, and the files themselves.
 from typing import Any, Final
 
 from server.core.docstrings import attribute_docstrings
-from server.scene.manifest import FieldFile, Manifest, Phase
+from server.scene.manifest import DIRECTIONS_FORMAT, EARS_FORMAT, MESH_FORMAT, FieldFile, Manifest, Phase
 
 _DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 _WHERE: Final = {
@@ -24,6 +24,11 @@ _WHERE: Final = {
     },
 }
 """What one field of an object asks of another, by the object's name."""
+_FORMATS: Final = {
+    "if": {"properties": {"mesh": {"type": "object"}}, "required": ["mesh"]},
+    "then": {"properties": {"format_version": {"const": MESH_FORMAT}}, "required": ["format_version"]},
+    "else": {"properties": {"format_version": {"enum": [EARS_FORMAT, DIRECTIONS_FORMAT]}}},
+}
 
 
 def manifest_schema() -> dict[str, Any]:
@@ -36,4 +41,4 @@ def manifest_schema() -> dict[str, Any]:
     schema["properties"]["files"]["additionalProperties"] = False  # pydantic gives the pattern of names alone
     for name, condition in _WHERE.items():
         schema["$defs"][name] |= condition
-    return {"$schema": _DIALECT, **schema, "title": "Scene bundle of Nafir: scene.json"}
+    return {"$schema": _DIALECT, **schema, **_FORMATS, "title": "Scene bundle of Nafir: scene.json"}

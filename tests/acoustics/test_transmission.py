@@ -9,6 +9,7 @@ from server.acoustics.geometry import FloorPlan
 from server.acoustics.reflections import ReflectionFinder
 from server.acoustics.transmission import (
     AIR_IMPEDANCE,
+    PlanWallLosses,
     TransmittedPaths,
     normal_incidence_loss_db,
     transmission_loss_db,
@@ -76,7 +77,7 @@ def test_paths_through_walls_join_those_of_a_finder_emitter_by_emitter():
     emitters = np.array([[2.0, 3.0, 1.5], [6.0, 2.0, 1.8], [1.5, 4.5, 1.0], [6.5, 1.0, 1.2]])
     finder = ReflectionFinder(PLAN, np.full((3, len(OCTAVE_BANDS_HZ)), -3.0))
     mirrored = finder.find(listener, emitters)
-    found = TransmittedPaths(finder, PLAN, loss_db).find(listener, emitters)
+    found = TransmittedPaths(finder, PlanWallLosses(PLAN, loss_db)).find(listener, emitters)
     np.testing.assert_array_equal(found.emitter, np.sort(found.emitter))
     for number, emitter in enumerate(emitters):
         before, after = np.flatnonzero(mirrored.emitter == number), np.flatnonzero(found.emitter == number)

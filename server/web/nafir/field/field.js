@@ -29,7 +29,8 @@ const wallLossDb = (mass) =>
 const mirrorDb = ({ absorption, scattering }) =>
   absorption.map((absorbed, band) => 10 * Math.log10(Math.max(LEAST_POWER, (1 - absorbed) * (1 - scattering[band]))));
 
-function planOf({ geometry, bounds: { minimum, maximum } }) {
+function planOf({ id, geometry, mesh, bounds: { minimum, maximum } }) {
+  if (mesh) throw new Error(`scene ${id} is a triangle mesh, and only floor plans are computed in a browser`);
   if (geometry) return new FloorPlan({ corners: geometry.corners, height: geometry.height_m });
   const [[west, south, floor], [east, north, height]] = [minimum, maximum];
   return new FloorPlan({ corners: [[west, south], [east, south], [east, north], [west, north]], height, floor });
