@@ -4,7 +4,8 @@ Compiled code runs without the interpreter's lock, follows NumPy's rules for div
 NUMBA_CACHE_DIR if that is set, else beside the source, else in the user's cache folder. Numba by itself would reuse
 cached code as long as the file of the function is unchanged; here it is reused only as long as no module with compiled
 code has changed, nor, of a function outside the server, any module beside it. A cache beside the source in a read-only
-folder, as an image has it, is still read, also where NUMBA_CACHE_DIR is set and does not have the function yet.
+folder, as an image has it, is still read, also where NUMBA_CACHE_DIR is set and does not have the function yet. Of
+several processes that start at once, one compiles a function, and the others wait for what it stores.
 """
 
 import contextlib
@@ -13,10 +14,16 @@ import importlib
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
 
 import server.kernels.lean_numba  # noqa: F401
 
@@ -37,6 +44,10 @@ from numba.core.runtime import rtsys
 from server.kernels.dispatchers import CompiledFunction
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_LONGEST_COMPILATION_S: Final = 120.0
+"""What a slow and busy processor takes for the largest function: who compiles it for longer has been stopped."""
+_POLL_S: Final = 0.05
 
 
 def compiled(function: Function) -> Function:
@@ -204,6 +215,8 @@ def _without_module(environment: Environment) -> Environment:
 class _Cache(FunctionCache):  # type: ignore[misc]
     _impl_class = _CacheFiles
     compiled = 0
+    _lock: int | None = None
+    """The open file by which this process alone compiles the function."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -223,11 +236,42 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         rtsys.initialize(target)  # sets up the memory allocation of compiled code
         with self._guard_against_spurious_io_errors():
             key = self._index_key(signature, target.codegen())
-            for file in self.files:
-                if (kept := file.load(key)) is not None:
-                    return self._impl.rebuild(target, kept)
+            kept = self._load(key)
+            if kept is None and self._wait_for_others():
+                kept = self._load(key)
+            if kept is not None:
+                return self._impl.rebuild(target, kept)
         _look_for_no_blas()
         return None
+
+    def _load(self, key: object) -> Any:
+        return next((kept for file in self.files if (kept := file.load(key)) is not None), None)
+
+    def _wait_for_others(self) -> bool:
+        """Wait while another process compiles the function, and keep others from it until `end`. False where that
+        cannot be told, and where the other takes too long: then both compile."""
+        folder = Path(self.cache_path)
+        if fcntl is None or not _is_writable(folder):
+            return False
+        self._lock = os.open(folder / f"{self._impl.filename_base}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+        for _ in range(round(_LONGEST_COMPILATION_S / _POLL_S)):
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(_POLL_S)
+            except OSError:  # a file system without locks
+                return False
+            else:
+                return True
+        return False
+
+    def end(self) -> None:
+        """Let other processes compile the function, or load it."""
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._lock, fcntl.LOCK_UN)  # also of processes that were forked meanwhile
+            os.close(self._lock)
+            self._lock = None
 
     @classmethod
     def count(cls) -> None:

@@ -71,8 +71,9 @@ def _no_collections() -> Iterator[None]:
 class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
     """A function as Python calls it, compiled on its first call for each combination of types.
 
-    `cache` opens where its machine code is stored, when it is first called. `on_compiled` is called for each function
-    compiled in order to be called by compiled code.
+    `cache` opens where its machine code is stored, when it is first called; its `end` is called once a combination of
+    types has been loaded or compiled, or has failed. `on_compiled` is called for each function compiled in order to be
+    called by compiled code.
     """
 
     def __init__(
@@ -101,7 +102,10 @@ class CompiledFunction(CPUDispatcher):  # type: ignore[misc]
 
     def compile(self, sig: Any) -> Any:
         with _no_collections():
-            return super().compile(sig)
+            try:
+                return super().compile(sig)
+            finally:
+                self._cache.end()
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Numba asks for this, and then for `get_overload`, where compiled code calls the function."""

@@ -1,5 +1,6 @@
 """Compiled code is kept on disk, never outlives its source, and where it works in place allocates nothing."""
 
+import fcntl
 import os
 import pickle
 import shutil
@@ -54,6 +55,40 @@ def test_a_second_start_compiles_nothing(package):
     assert run(package) == (20, 0)
     assert run(package) == (20, 1)
     assert list((package / "server" / "__pycache__").glob("outer.outer-*.nbc"))
+
+
+def test_of_processes_that_start_at_once_one_compiles_and_the_others_load_it(package):
+    once_told = RUN.replace("; print", "; print(flush=True); input(); print")
+    command = [sys.executable, "-c", once_told]
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package)
+    processes = [
+        subprocess.Popen(
+            command, cwd=package, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(3)
+    ]
+    for process in processes:
+        process.stdout.readline()
+    for process in processes:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    assert sorted(process.communicate()[0].split() for process in processes) == [["20", "0"], ["20", "1"], ["20", "1"]]
+
+
+def test_who_compiles_for_too_long_is_not_waited_for(package):
+    assert run(package) == (20, 0)
+    (folder,) = package.glob("server/__pycache__")
+    (lock,) = folder.glob("outer.outer-*.lock")
+    for kept in folder.glob("outer.outer-*.nb*"):
+        kept.unlink()
+    source = package / "server" / "kernels" / "compiled.py"
+    source.write_text(
+        source.read_text().replace("_LONGEST_COMPILATION_S: Final = 120.0", "_LONGEST_COMPILATION_S = 0.2")
+    )
+    with lock.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert run(package) == (20, 0)
 
 
 def test_what_is_kept_runs_without_what_only_compiling_needs(package):

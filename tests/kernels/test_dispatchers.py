@@ -76,6 +76,11 @@ def test_what_a_called_function_may_not_do_is_said_when_it_is_compiled():
         outer(1.0)
 
 
+class Nowhere(NullCache):
+    def end(self):
+        pass
+
+
 def test_the_garbage_collector_rests_while_code_is_compiled_and_then_goes_on():
     def fails(x):
         return x.no_such_attribute
@@ -84,8 +89,8 @@ def test_the_garbage_collector_rests_while_code_is_compiled_and_then_goes_on():
         return square_root(x)
 
     seen = []
-    function = CompiledFunction(fails, {"nopython": True}, cache=NullCache, on_compiled=lambda: None)
-    caller = CompiledFunction(calls, {"nopython": True}, cache=NullCache, on_compiled=lambda: None)
+    function = CompiledFunction(fails, {"nopython": True}, cache=Nowhere, on_compiled=lambda: None)
+    caller = CompiledFunction(calls, {"nopython": True}, cache=Nowhere, on_compiled=lambda: None)
     square_root._called._on_compiled, told = lambda: seen.append(gc.isenabled()), square_root._called._on_compiled
     try:
         assert caller(np.float32(4)) == 2
