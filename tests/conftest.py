@@ -5,8 +5,8 @@ Sound decays, is louder nearby (1 / distance), and louder in the ear on its side
 
 import io
 import os
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 # Before NumPy is imported. The waiting threads of its products and torch's would take the time of other workers.
@@ -32,19 +32,19 @@ from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, 
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
 
-_LONG_FIRST = (
+_COMPUTING = (
     "training/bundling/test_export.py",
-    "page/",
-    "integration/",
-    "training/bundling/",
     "training/simulation/",
+    "training/bundling/",
     "training/",
     "streaming/",
     "scene/",
     "cli/",
 )
-"""Files that take longest, by how their names begin, in this order: what begins last should be short. The first makes
-the bundle for which others of its folder would wait."""
+"""Files that take long, by how their names begin, in this order: what begins last should be short. The first makes the
+bundle for which others of its folder would wait, if they came next."""
+_WAITING = ("page/", "integration/", "clients/")
+"""Files that take long as well, but wait: for browsers, and for sound to pass."""
 
 _TIMED = ("bench/", "integration/", "runtime/", "streaming/")
 """Folders with `timed` tests: TIMED of the Makefile."""
@@ -69,24 +69,25 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Raises UsageError for a `timed` test where `make test` would not look for it."""
 
-    @cache
-    def place(path: Path) -> str:
-        return path.parent.relative_to(Path(__file__).parent).as_posix() + "/"
-
-    def folder(item: pytest.Item) -> str:
-        return place(item.path)
-
+    names = {path: path.relative_to(Path(__file__).parent).as_posix() for path in {item.path: None for item in items}}
     for item in items:
-        if item.get_closest_marker("timed") and not folder(item).startswith(_TIMED):
+        if item.get_closest_marker("timed") and not names[item.path].startswith(_TIMED):
             raise pytest.UsageError(
                 f"{item.nodeid} is timed: `make test` has to be told its folder, as has conftest.py"
             )
-    items.sort(
-        key=lambda item: next(
-            (at for at, start in enumerate(_LONG_FIRST) if f"{folder(item)}{item.path.name}".startswith(start)),
-            len(_LONG_FIRST),
-        )
+    turn = {name: number for number, name in enumerate(in_turn(list(names.values())))}
+    items.sort(key=lambda item: turn[names[item.path]])
+
+
+def in_turn(names: Sequence[str]) -> list[str]:
+    """Names of files in the order in which they begin. Those that take long come first, one that computes and one that
+    waits by turns: while some workers wait, others have the cores."""
+    computing, waiting = (
+        [name for start in starts for name in names if start == next(filter(name.startswith, starts), None)]
+        for starts in (_COMPUTING, _WAITING)
     )
+    long = [name for couple in zip_longest(computing, waiting) for name in couple if name is not None]
+    return [*long, *(name for name in names if not name.startswith(_COMPUTING + _WAITING))]
 
 
 CODEC = CodecParameters(
