@@ -12,6 +12,7 @@ A `Session` belongs to the thread that renders it. Positions are in metres, cloc
 """
 
 import math
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 
 from server.acoustics.decibels import db_to_amplitude
@@ -542,7 +543,8 @@ class Session:
 
     def _tap(self, live: LiveInput | None) -> Source:
         assert live is not None, "an emitter plays a clip or is live"
-        renderer = self.renderer
+        # A renderer holds its sources. One that held it in turn would be a cycle, which only the collector frees.
+        renderer = weakref.proxy(self.renderer)
         return live.shared.tap(lambda: renderer.sample_clock)
 
     def _open_clip(self, message: AddEmitter, clip: DryAudio | FloatArray) -> ClipPlayer:

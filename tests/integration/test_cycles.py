@@ -5,6 +5,7 @@ import gc
 import time
 import weakref
 
+import numpy as np
 import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
@@ -12,6 +13,9 @@ from websockets.exceptions import ConnectionClosed
 from server.api import connection as streaming
 from server.api.http_protocol import HttpProtocol
 from server.api.web_socket import WebSocketProtocol
+from server.protocol.blocks import DryBlock
+from server.protocol.client_messages import AddEmitter, AddListener, RemoveListener
+from server.rendering.renderer import Renderer
 from server.streaming.session import Session
 from server.streaming.stream import Stream
 from tests.integration.churn import HELLO, visit
@@ -24,7 +28,8 @@ PATIENCE_S = 5.0
 @pytest.fixture
 def made(monkeypatch):
     """Weak references to all sessions, streams, connections and protocols made from now on, by kind."""
-    references = {Session: [], Stream: [], streaming.Connection: [], HttpProtocol: [], WebSocketProtocol: []}
+    kinds = (Session, Renderer, Stream, streaming.Connection, HttpProtocol, WebSocketProtocol)
+    references = {kind: [] for kind in kinds}
 
     class Remembering:
         def __init__(self, kind):
@@ -47,6 +52,7 @@ def made(monkeypatch):
     remember(HttpProtocol)
     remember(WebSocketProtocol)
     monkeypatch.setattr(streaming, "Session", Remembering(Session))
+    monkeypatch.setattr("server.responses.direct_sound.Renderer", Remembering(Renderer))
     monkeypatch.setattr(streaming, "Stream", Remembering(Stream))
     monkeypatch.setattr("server.api.routes.Connection", Remembering(streaming.Connection))
     return references
@@ -85,11 +91,28 @@ async def _break_the_protocol(address):
         await _read_until_closed(socket, "1002")
 
 
+async def _speak_to_several(address):
+    """Live sound, heard by three listeners, one of whom leaves before the connection is dropped."""
+    async with connect(f"ws://{address}/v1/stream", compression=None, max_queue=None) as socket:
+        await socket.send(HELLO)
+        await socket.send(AddEmitter(id="voice", live=True, position=(6.0, 3.0, 1.5)).serialize())
+        for name in ("p2", "p3"):
+            await socket.send(AddListener(id=name, position=(2.0, 2.5, 1.5)).serialize())
+        await socket.send(RemoveListener(id="p2").serialize())
+        for number in range(20):
+            await socket.send(DryBlock("voice", number, np.ones(256, np.float32)).serialize("f32"))
+        while not isinstance(message := await socket.recv(), str) or "listener_removed" not in message:
+            pass
+        await socket.recv()
+        socket.transport.abort()
+
+
 ENDS = {
     "said goodbye": lambda address: visit(address, blocks=10, emitters=4),
     "dropped the connection": lambda address: visit(address, blocks=10, emitters=4, is_aborted=True),
     "was sent away": _say_nothing_more,
     "broke the protocol": _break_the_protocol,
+    "spoke to several listeners": _speak_to_several,
 }
 
 
@@ -105,7 +128,9 @@ def test_nothing_outlives_its_connection(monkeypatch, request, made, end):
     assert left(made) == dict.fromkeys(made, 0)
     # Every question whether the server is ready has a connection of its own.
     assert len(made.pop(HttpProtocol)) > 1
-    assert [len(references) for references in made.values()] == [1] * 4
+    listeners = 3 if end is _speak_to_several else 1
+    assert len(made.pop(Renderer)) >= listeners  # and those of measurements
+    assert [len(references) for references in made.values()] == [listeners, 1, 1, 1]
 
 
 def left(made):

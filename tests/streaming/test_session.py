@@ -1,5 +1,7 @@
+import gc
 import json
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -172,6 +174,22 @@ def test_what_is_sent_live_sounds_as_the_same_clip_does(field, filters):
     clip = heard(AddEmitter(id="a", clip="noise", position=THERE), [])
     samples = 5_000  # before it ends
     assert_allclose(live[:, :samples], clip[:, :samples], atol=1e-8)
+
+
+def test_a_session_that_played_live_sound_is_freed_at_once(field, filters):
+    """Its renderer has megabytes, and the collector of cycles comes seldom."""
+    session = Session(HELLO, FieldsByLevel([field]), filters, load_clip, quality=FULL, window=1_000)
+    add(session, "voice", clip=None, live=True)
+    answer(session, field)
+    session.receive(DryBlock("voice", 0, CLIP))
+    hear(session, 3)
+    renderer = weakref.ref(session.renderer)
+    gc.disable()
+    try:
+        del session
+        assert renderer() is None
+    finally:
+        gc.enable()
 
 
 def test_live_blocks_have_to_come_in_order(session, field):
