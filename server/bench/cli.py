@@ -171,6 +171,9 @@ def stream(
     block_size: Annotated[
         int, typer.Option(help="Samples of each block. Poses count from the next block on: short blocks cost more.")
     ] = 256,
+    listeners: Annotated[
+        int, typer.Option(min=1, max=8, help="Of each session, in one stream. Goals are for one.")
+    ] = 1,
     as_json: AsJson = False,
 ) -> Outcome:
     """How many sessions one core serves, with fewer than one block in a thousand late.
@@ -192,6 +195,7 @@ def stream(
         poses_per_s=poses_per_second,
         sways=moving_emitters,
         block_size=cast("BlockSize", block_size),
+        listeners=listeners,
     )
     measured = measure_sessions(plan, _steps_told())
     judgements = [Judgement(**row) for row in measured["summary"]]

@@ -19,7 +19,7 @@ from functools import partial
 
 import numpy as np
 
-from server.bench.gauge import POSE_IDS, Waiting
+from server.bench.gauge import BLOCK_LISTENER, POSE_IDS, Waits
 from server.bench.places import Circle, Places
 from server.bench.scene import CLIP
 from server.protocol.blocks import AudioBlock
@@ -27,6 +27,7 @@ from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
+    AddListener,
     BlockSize,
     Hello,
     ListenerPose,
@@ -85,8 +86,8 @@ class FrameReader:
 
 
 class Walker(asyncio.Protocol):
-    """One client. The future `sounds` is done when all its emitters are heard, and fails with ConnectionError if that
-    becomes impossible. With `sways` its emitters move on their circles."""
+    """One client. The future `sounds` is done when its listeners are there and all its emitters are heard, and fails
+    with ConnectionError if that becomes impossible. With `sways` its emitters move on their circles."""
 
     def __init__(
         self,
@@ -97,16 +98,21 @@ class Walker(asyncio.Protocol):
         poses_per_s: float,
         sways: bool,
         block_size: BlockSize = BLOCK_SIZE,
+        listeners: int = 1,
     ) -> None:
         self.sounds: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.poses, self.reverberation = Waiting(), Waiting()
+        self.waits = Waits()
         self.blocks = 0
         self.errors: list[str] = []
         self._places = places
         self._emitters = emitters
         self._sways = sways
         self._block_size = block_size
-        self._silent = len(emitters)
+        self._missing = len(emitters) + listeners - 1
+        """Emitters and further listeners of which the server has not said that they are there."""
+        self._listeners = listeners
+        self._ids: dict[int, str | None] = {0: None}
+        """Those of the listeners that are there, by number."""
         self._phase = phase
         self._poses_per_s = poses_per_s
         self._reader = FrameReader()
@@ -158,13 +164,12 @@ class Walker(asyncio.Protocol):
 
     @property
     def hears_all(self) -> bool:
-        """Whether all emitters are heard and the connection is open."""
-        return self._silent == 0 and not self.is_lost
+        """Whether all listeners hear all emitters and the connection is open."""
+        return self._missing == 0 and not self.is_lost
 
     def begin(self) -> None:
         """Reset counts and times."""
-        self.poses.begin()
-        self.reverberation.begin()
+        self.waits.begin()
         self.blocks = 0
         self.errors = []
 
@@ -181,9 +186,13 @@ class Walker(asyncio.Protocol):
             protocol=PROTOCOL,
             scene=self._places.bundle.id,
             emitters=len(self._emitters),
+            listeners=None if self._listeners == 1 else self._listeners,
             block_size=self._block_size,
         )
         self._send(_TEXT, hello.serialize().encode())
+        for number in range(1, self._listeners):
+            position = self._places.walk.at(self._angle(0.0, number))
+            self._send(_TEXT, AddListener(id=f"listener-{number}", position=position).serialize().encode())
         for number, circle in enumerate(self._emitters):
             position = circle.at(0.0) if self._sways else circle.centre
             self._send(_TEXT, AddEmitter(id=str(number), clip=CLIP, position=position).serialize().encode())
@@ -192,9 +201,11 @@ class Walker(asyncio.Protocol):
 
     def _receive_text(self, payload: bytes) -> None:
         message = json.loads(payload)
-        if message["type"] == "emitter_added":
-            self._silent -= 1
-            if self._silent == 0 and not self.sounds.done():
+        if message["type"] in {"emitter_added", "listener_added"}:
+            if "index" in message:
+                self._ids[message["index"]] = message["id"]
+            self._missing -= 1
+            if self._missing == 0 and not self.sounds.done():
                 self.sounds.set_result(None)
         elif message["type"] == "welcome":
             self.answered_s = time.monotonic()
@@ -207,12 +218,12 @@ class Walker(asyncio.Protocol):
         if payload[0] != AudioBlock.KIND:
             return
         self.blocks += 1
-        now_s = time.monotonic()
-        for waiting, pose_id in zip((self.poses, self.reverberation), POSE_IDS.unpack_from(payload), strict=True):
-            waiting.leave(pose_id, now_s)
-        if self.blocks % _ACKNOWLEDGE_EVERY == 0:
-            (sequence,) = _SEQUENCE.unpack_from(payload)
-            self._send(_TEXT, Acknowledge(sequence=sequence).serialize().encode())
+        listener = payload[BLOCK_LISTENER]
+        self.waits.leave(listener, POSE_IDS.unpack_from(payload), time.monotonic())
+        (sequence,) = _SEQUENCE.unpack_from(payload)
+        if sequence % _ACKNOWLEDGE_EVERY == 0:
+            acknowledged = Acknowledge(sequence=sequence, listener=self._ids[listener])
+            self._send(_TEXT, acknowledged.serialize().encode())
 
     def _walk(self) -> None:
         loop = asyncio.get_running_loop()
@@ -220,17 +231,23 @@ class Walker(asyncio.Protocol):
         # Scheduled from the previous due time, so that delays do not add up.
         assert self._next_pose is not None
         self._next_pose = loop.call_at(self._next_pose.when() + 1 / self._poses_per_s, self._walk)
-        angle = 2 * math.pi * ((step + self._phase) / self._poses_per_s / _TURN_S + self._phase)
+        passed_s = (step + self._phase) / self._poses_per_s
         if self._sways:
+            angle = self._angle(passed_s, 0)
             for number, circle in enumerate(self._emitters):
                 moved = MoveEmitter(id=str(number), pose_id=next(self._pose_ids), position=circle.at(angle))
                 self._send(_TEXT, moved.serialize().encode())
-        pose_id = next(self._pose_ids)
-        yaw = math.remainder(angle, 2 * math.pi)
-        pose = ListenerPose(pose_id=pose_id, position=self._places.walk.at(angle), yaw=yaw)
-        for waiting in (self.poses, self.reverberation):
-            waiting.enter(pose_id, time.monotonic())
-        self._send(_BINARY, pose.serialize_binary())
+        for number in tuple(self._ids):
+            angle, pose_id = self._angle(passed_s, number), next(self._pose_ids)
+            yaw = math.remainder(angle, 2 * math.pi)
+            position = self._places.walk.at(angle)
+            pose = ListenerPose(pose_id=pose_id, position=position, yaw=yaw, index=number or None)
+            self.waits.enter(number, pose_id, time.monotonic())
+            self._send(_BINARY, pose.serialize_binary())
+
+    def _angle(self, passed_s: float, listener: int) -> float:
+        """Where on its circle a listener is after some seconds: those of one stream are spread evenly."""
+        return 2 * math.pi * (passed_s / _TURN_S + self._phase + listener / self._listeners)
 
     def _send(self, opcode: int, payload: bytes) -> None:
         if self._transport is not None and not self._transport.is_closing():
@@ -254,7 +271,7 @@ class Walker(asyncio.Protocol):
 
 class Crowd:
     """The walkers at the server on `port`. Each has `emitters` emitters at places of its own, which move as often as
-    the walker with `sways`. With no poses all stand still."""
+    the walker with `sways`, and `listeners` listeners in its stream. With no poses all stand still."""
 
     def __init__(
         self,
@@ -265,10 +282,12 @@ class Crowd:
         poses_per_s: float,
         sways: bool = False,
         block_size: BlockSize = BLOCK_SIZE,
+        listeners: int = 1,
     ) -> None:
         self._port = port
         self._places = places
         self.emitters = emitters
+        self.listeners = listeners
         self.poses_per_s = poses_per_s
         self._sways = sways
         self._block_size = block_size
@@ -281,8 +300,8 @@ class Crowd:
 
     @property
     def blocks_per_s(self) -> float:
-        """Blocks that each walker should get per second."""
-        return self._places.bundle.manifest.codec.sample_rate / self._block_size
+        """Blocks that each walker should get per second, for all its listeners."""
+        return self.listeners * self._places.bundle.manifest.codec.sample_rate / self._block_size
 
     async def resize(self, count: int) -> None:
         """Change to `count` walkers, and wait until all their emitters are heard. Raises ConnectionError or
@@ -314,7 +333,15 @@ class Crowd:
     async def _connect(self, number: int) -> Walker:
         emitters = self._places.emitters(self.emitters, self._rng)
         pace = {"phase": number * _GOLDEN % 1, "poses_per_s": self.poses_per_s}
-        make = partial(Walker, self._places, emitters, **pace, sways=self._sways, block_size=self._block_size)
+        make = partial(
+            Walker,
+            self._places,
+            emitters,
+            **pace,
+            sways=self._sways,
+            block_size=self._block_size,
+            listeners=self.listeners,
+        )
         _, walker = await asyncio.get_running_loop().create_connection(make, "127.0.0.1", self._port)
         return walker
 

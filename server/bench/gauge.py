@@ -13,9 +13,10 @@ import os
 import struct
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,14 @@ from server.protocol.server_messages import Durations
 from server.rendering.convolver import Sharing
 from server.streaming.quality_steps import QualityStep
 from server.streaming.stream import Stream
+from server.streaming.stream_times import StreamTimes
 
 POSE_ID = struct.Struct("<4xI")
 """The pose id in a binary listener pose."""
 POSE_IDS = struct.Struct("<16xII")
 """The two pose ids in an audio block: of the direct sound and of the impulse responses."""
+POSE_LISTENER, BLOCK_LISTENER = 1, 3
+"""The bytes of both that have the number of the listener."""
 
 _LOOK_EVERY_S = 0.1
 """Time between looks at the quality of all streams. It changes at most four times a second."""
@@ -89,11 +93,29 @@ def latencies(waits: Iterable[Waiting], now_s: float) -> dict[str, float | None]
     return {**Durations.of(times).model_dump(), "longest": 1000 * longest_s, "answered": answered}
 
 
-class _Watch:
-    """The latencies of one connection."""
+class Waits:
+    """The latencies of one connection, by the numbers of its listeners."""
 
     def __init__(self) -> None:
-        self.direct, self.reverberation = Waiting(), Waiting()
+        self.direct: defaultdict[int, Waiting] = defaultdict(Waiting)
+        self.reverberation: defaultdict[int, Waiting] = defaultdict(Waiting)
+
+    def begin(self) -> None:
+        for waiting in (*self.direct.values(), *self.reverberation.values()):
+            waiting.begin()
+
+    def enter(self, listener: int, pose_id: int, now_s: float) -> None:
+        for waits in (self.direct, self.reverberation):
+            waits[listener].enter(pose_id, now_s)
+
+    def leave(self, listener: int, pose_ids: tuple[int, int], now_s: float) -> None:
+        """A block of a listener has these poses of its direct sound and of its impulse responses."""
+        for waits, pose_id in zip((self.direct, self.reverberation), pose_ids, strict=True):
+            waits[listener].leave(pose_id, now_s)
+
+    def behind_s(self, now_s: float) -> float:
+        """How long the oldest pose without its reverberation has waited."""
+        return max((wait_s for each in self.reverberation.values() for wait_s in each.unanswered_s(now_s)), default=0.0)
 
 
 class _Counts:
@@ -102,13 +124,19 @@ class _Counts:
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self._late, self._dropped, self._sent = self._now()
+        self.listeners = len(self.times)
         # The audio thread finds the new histograms with the next block. Nothing else replaces them.
-        times = stream.times
-        times.render, times.lateness, times.response = (DurationHistogram() for _ in range(3))
+        for times in self.times:
+            times.render, times.lateness, times.response = (DurationHistogram() for _ in range(3))
 
     def _now(self) -> tuple[int, int, int]:
-        session = self.stream.session
-        return self.stream.blocks_late, session.blocks_dropped, session.window.sent
+        counts, _ = self.stream.audience.totals()
+        return self.stream.blocks_late, counts["dropped"], counts["sent"]
+
+    @property
+    def times(self) -> list[StreamTimes]:
+        """Those of all listeners."""
+        return [member.times for member in self.stream.audience.members]
 
     @property
     def since(self) -> tuple[int, int, int]:
@@ -128,7 +156,7 @@ class Gauge:
         self._time_s = time_s
         self._meter = meter
         self._began_spent: dict[tuple[Thread, str], Spent] = {}
-        self._watches: set[_Watch] = set()
+        self._watches: set[Waits] = set()
         self._counts: list[_Counts] = []
         self._began_s = self._began_cpu_s = 0.0
         self._began_thread_cpu_s: dict[threading.Thread, float] = {}
@@ -156,15 +184,13 @@ class Gauge:
                 await self._app(scope, receive, send)
 
     async def _watch(self, scope: Scope, receive: Receive, send: Send) -> None:
-        watch = _Watch()
+        watch = Waits()
 
         def see_pose(data: str | bytes) -> None:
             self._received += 1
             if isinstance(data, bytes) and data and data[0] == ListenerPose.KIND:
                 (pose_id,) = POSE_ID.unpack_from(data)
-                now_s = self._time_s()
-                watch.direct.enter(pose_id, now_s)
-                watch.reverberation.enter(pose_id, now_s)
+                watch.enter(data[POSE_LISTENER], pose_id, self._time_s())
 
         async def receive_pose() -> Message:
             message = await receive()
@@ -174,10 +200,9 @@ class Gauge:
         def see_blocks(messages: Sequence[bytes]) -> None:
             """Record the blocks among messages sent at one moment."""
             now_s = self._time_s()
-            blocks = {POSE_IDS.unpack_from(data) for data in messages if data[0] == AudioBlock.KIND}
-            for pose_id, reverberation_pose_id in blocks:
-                watch.direct.leave(pose_id, now_s)
-                watch.reverberation.leave(reverberation_pose_id, now_s)
+            audio = [data for data in messages if data[0] == AudioBlock.KIND]
+            for listener, pose_ids in {(data[BLOCK_LISTENER], POSE_IDS.unpack_from(data)) for data in audio}:
+                watch.leave(listener, pose_ids, now_s)
 
         async def send_block(message: Message) -> None:
             await send(message)
@@ -193,8 +218,7 @@ class Gauge:
     def _begin(self, host: StreamHost) -> None:
         self._counts = [_Counts(stream) for stream in host.audio.streams]
         for watch in self._watches:
-            watch.direct.begin()
-            watch.reverberation.begin()
+            watch.begin()
         self._looks = self._below_best = 0
         if self._next_look is not None:
             self._next_look.cancel()
@@ -210,15 +234,16 @@ class Gauge:
         duration_s = self._time_s() - self._began_s
         blocks = [counts.since for counts in self._counts]
         late, dropped, sent = (sum(column) for column in zip(*blocks, strict=True)) if blocks else (0, 0, 0)
-        due = sum(duration_s / counts.stream.block_s for counts in self._counts)
+        due = sum(counts.listeners * duration_s / counts.stream.block_s for counts in self._counts)
+        listeners = sum(counts.listeners for counts in self._counts)
         return {
             "duration_s": duration_s,
             "streams": len(self._counts),
             "blocks_sent": sent,
             "blocks_late": late,
             "blocks_dropped": dropped,
-            # A stream that falls behind skips time. One block of each stream may be in progress at either end.
-            "blocks_missing": max(0, round(due) - sent - dropped - len(self._counts)),
+            # A stream that falls behind skips time. One block of each listener may be in progress at either end.
+            "blocks_missing": max(0, round(due) - sent - dropped - listeners),
         }
 
     def _report(self) -> dict[str, Any]:
@@ -227,12 +252,14 @@ class Gauge:
         self._look_at_quality()
         return {
             **blocks,
-            "block_ms": merged(counts.stream.times.render for counts in self._counts),
-            "lateness_ms": merged(counts.stream.times.lateness for counts in self._counts),
-            "ir_ms": merged(counts.stream.times.response for counts in self._counts),
-            "pose_to_audio_ms": latencies([watch.direct for watch in self._watches], now_s),
-            "pose_to_reverberation_ms": latencies([watch.reverberation for watch in self._watches], now_s),
-            "behind_s": [max(watch.reverberation.unanswered_s(now_s), default=0.0) for watch in self._watches],
+            "block_ms": merged(times.render for counts in self._counts for times in counts.times),
+            "lateness_ms": merged(times.lateness for counts in self._counts for times in counts.times),
+            "ir_ms": merged(times.response for counts in self._counts for times in counts.times),
+            "pose_to_audio_ms": latencies(chain(*(watch.direct.values() for watch in self._watches)), now_s),
+            "pose_to_reverberation_ms": latencies(
+                chain(*(watch.reverberation.values() for watch in self._watches)), now_s
+            ),
+            "behind_s": [watch.behind_s(now_s) for watch in self._watches],
             "quality_at_end": Counter(_describe(counts.stream.session.quality) for counts in self._counts),
             "below_best_share": self._below_best / self._looks if self._looks else 0.0,
             "server_load": (time.process_time() - self._began_cpu_s) / duration_s,

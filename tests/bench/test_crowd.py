@@ -9,11 +9,19 @@ from websockets.frames import Frame, Opcode
 from websockets.streams import StreamReader
 
 from server.bench.crowd import FrameReader, Walker, frame
-from server.bench.gauge import POSE_ID, POSE_IDS
+from server.bench.gauge import BLOCK_LISTENER, POSE_ID, POSE_IDS, POSE_LISTENER
 from server.bench.places import Places
 from server.bench.scene import bundle_of
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import AddEmitter, Hello, ListenerPose, MoveEmitter, parse_client_message
+from server.protocol.client_messages import (
+    Acknowledge,
+    AddEmitter,
+    AddListener,
+    Hello,
+    ListenerPose,
+    MoveEmitter,
+    parse_client_message,
+)
 
 LENGTHS = (0, 1, 125, 126, 127, 2_076, 65_535)
 
@@ -46,11 +54,13 @@ def test_what_a_server_sends_is_cut_into_messages_however_it_comes(piece):
 
 def test_pose_ids_stand_where_they_are_looked_for():
     block = AudioBlock(
-        sequence=1, sample_clock=2, pose_id=3, reverberation_pose_id=4, samples=np.zeros((2, 8), np.float32)
+        sequence=1, sample_clock=2, pose_id=3, reverberation_pose_id=4, samples=np.zeros((2, 8), np.float32), listener=6
     )
     assert POSE_IDS.unpack_from(block.serialize("f32")) == (3, 4)
-    pose = ListenerPose(pose_id=5, position=(1.0, 2.0, 3.0))
+    assert block.serialize("f32")[BLOCK_LISTENER] == 6
+    pose = ListenerPose(pose_id=5, position=(1.0, 2.0, 3.0), index=7)
     assert POSE_ID.unpack_from(pose.serialize_binary()) == (5,)
+    assert pose.serialize_binary()[POSE_LISTENER] == 7
 
 
 class Transport:
@@ -89,7 +99,8 @@ def test_emitters_move_with_their_listener_if_they_are_to(sways):
             walker._next_pose.cancel()  # not when it would be time
             walker._walk()
         walker.close()
-        return transport.messages, walker.poses.unanswered_s(0.0), walker.reverberation.unanswered_s(0.0)
+        waits = walker.waits
+        return transport.messages, waits.direct[0].unanswered_s(0.0), waits.reverberation[0].unanswered_s(0.0)
 
     messages, direct, reverberation = asyncio.run(scenario())
     hello, *adds = messages[:4]
@@ -105,3 +116,44 @@ def test_emitters_move_with_their_listener_if_they_are_to(sways):
     for message in (*adds, *moved):
         places.bundle.require_inside(message.position, "position")
     assert len({message.position for message in moved}) > 4 * sways
+
+
+def test_each_listener_of_a_stream_walks_acknowledges_and_waits_for_itself():
+    places = Places.of(bundle_of("apartment"))
+
+    async def scenario():
+        emitters = places.emitters(1, np.random.default_rng(0))
+        walker = Walker(places, emitters, phase=0.25, poses_per_s=30.0, sways=False, listeners=3)
+        walker._transport = transport = Transport()
+        walker._begin()
+        begun = transport.messages[:]
+        for number in (1, 2):
+            told = f'{{"type": "listener_added", "id": "listener-{number}", "index": {number}, "sample_clock": 0}}'
+            walker._receive_text(told.encode())
+        assert not walker.hears_all
+        walker._receive_text(b'{"type": "emitter_added", "id": "0", "sample_clock": 0}')
+        assert walker.hears_all
+        transport.messages.clear()
+        walker._next_pose.cancel()
+        walker._walk()
+        poses = transport.messages[:]
+        transport.messages.clear()
+        silence = np.zeros((2, 8), np.float32)
+        for sequence in range(5):
+            newest = poses[-1].pose_id
+            walker._receive_audio(AudioBlock(sequence, 0, newest, newest, silence, listener=2).serialize("f32"))
+        waiting = {number: len(walker.waits.direct[number].unanswered_s(0.0)) for number in range(3)}
+        walker.close()
+        return begun, poses, transport.messages, waiting, walker.blocks
+
+    (hello, *added, emitter), poses, acknowledged, waiting, blocks = asyncio.run(scenario())
+    assert (hello.listeners, hello.emitters) == (3, 1)
+    assert [each.id for each in added] == ["listener-1", "listener-2"]
+    assert all(isinstance(each, AddListener) for each in added)
+    assert isinstance(emitter, AddEmitter)
+    assert [each.index for each in poses] == [None, 1, 2]
+    assert len({each.position for each in poses}) == 3
+    assert sorted(each.pose_id for each in poses) == [each.pose_id for each in poses]
+    assert acknowledged == [Acknowledge(sequence=number, listener="listener-2") for number in (0, 4)]
+    assert waiting == {0: 1, 1: 1, 2: 0}
+    assert blocks == 5

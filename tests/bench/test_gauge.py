@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from server.bench import gauge as gauges
-from server.bench.gauge import Gauge, Waiting, latencies
+from server.bench.gauge import Gauge, Waiting, Waits, latencies
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import ListenerPose
 from server.streaming.load_policy import Ladder
@@ -162,6 +162,18 @@ def test_poses_are_timed_from_arrival_to_the_socket_and_messages_pass_unchanged(
     assert report["pose_to_reverberation_ms"]["p99"] == pytest.approx(31, rel=0.03)
 
 
+def test_poses_of_each_listener_wait_for_its_own_blocks():
+    waits = Waits()
+    for listener, pose_id in ((0, 1), (1, 2), (0, 3)):
+        waits.enter(listener, pose_id, 0.0)
+    waits.leave(1, (2, 0), 0.010)
+    assert [len(waits.direct[number].unanswered_s(1.0)) for number in (0, 1)] == [2, 0]
+    assert waits.behind_s(1.0) == 1.0
+    waits.leave(0, (3, 3), 0.020)
+    waits.leave(1, (3, 3), 0.020)
+    assert waits.behind_s(1.0) == 0.0
+
+
 async def ask(gauge, path):
     sent = []
 
@@ -195,16 +207,34 @@ class Stream:
         self.ladder = Ladder((BEST, LESS))
         self.blocks_late = 7
         self.times = StreamTimes()
+        self.audience = Audience(self)
 
 
-def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_ones_found(monkeypatch):
+class Audience:
+    """One listener, or another one beside it whose numbers are the same."""
+
+    def __init__(self, stream, *, listeners=1):
+        self.session = stream.session
+        self.members = [SimpleNamespace(times=times) for times in (stream.times, StreamTimes())][:listeners]
+
+    def totals(self):
+        counts = {"sent": self.session.window.sent, "dropped": self.session.blocks_dropped}
+        return {name: len(self.members) * count for name, count in counts.items()}, []
+
+
+@pytest.mark.parametrize("listeners", [1, 2])
+def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_ones_found(monkeypatch, listeners):
     stream, clock = Stream(), Clock()
+    stream.session = Session()
+    stream.session.window = Window()
+    stream.audience = Audience(stream, listeners=listeners)
     monkeypatch.setattr(Audio, "streams", (stream,))
     gauge = Gauge(None, time_s=clock)
 
     async def scenario():
         await ask(gauge, "/bench/begin")
-        stream.times.render.add(0.002)
+        for member in stream.audience.members:
+            member.times.render.add(0.002)
         stream.session.window.sent += 90
         stream.session.blocks_dropped += 3
         stream.blocks_late += 2
@@ -213,7 +243,7 @@ def test_blocks_are_counted_from_the_beginning_of_the_measurement_and_missing_on
 
     blocks, report = asyncio.run(scenario())
     counts = {name: report[f"blocks_{name}"] for name in ("sent", "late", "dropped", "missing")}
-    assert counts == {"sent": 90, "late": 2, "dropped": 3, "missing": 6}
+    assert counts == {"sent": 90 * listeners, "late": 2, "dropped": 3 * listeners, "missing": 6 * listeners}
     assert blocks == {name: report[name] for name in blocks}
     assert len(blocks) == 6
     assert report["block_ms"]["p50"] == pytest.approx(2, rel=0.03)

@@ -198,6 +198,7 @@ def test_a_run_that_passed_reaches_its_goals():
     ("changes", "reason"),
     [
         ({"poses_per_s": 0, "pose_to_audio_ms": followed(None, 0)}, "nobody moves"),
+        ({"listeners": 3}, "streams of one listener, and these had 3"),
         ({"poses_per_s": 10}, "30 poses a second"),
         ({"duration_s": 8.0}, "this run took 8"),
     ],

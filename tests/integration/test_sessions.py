@@ -17,24 +17,29 @@ pytestmark = [
 
 
 @pytest.mark.parametrize(
-    ("scene", "sample_rate"), [("bench", 48_000), pytest.param("apartment", 24_000, marks=pytest.mark.long)]
+    ("scene", "sample_rate", "listeners"),
+    [
+        ("bench", 48_000, 2),
+        pytest.param("bench", 48_000, 1, marks=pytest.mark.long),
+        pytest.param("apartment", 24_000, 1, marks=pytest.mark.long),
+    ],
 )
-def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own(monkeypatch, scene, sample_rate):
+def test_stream_bench_measures_so_many_sessions_of_a_server_of_its_own(monkeypatch, scene, sample_rate, listeners):
     monkeypatch.setattr(sessions, "_SETTLE_S", 0.5)
     usable = os.sched_getaffinity(0)
     options = ["--scene", scene, "--emitters", "3", "--sessions", "2", "--duration-s", "2", "--json"]
-    outcome = CliRunner().invoke(app, ["stream", *options])
+    outcome = CliRunner().invoke(app, ["stream", "--listeners", str(listeners), *options])
     measured = json.loads(outcome.stdout)
     assert [(each["id"], each["sample_rate"]) for each in measured["scenes"]] == [(scene, sample_rate)]
     (case,) = measured["cases"]
     assert case["scene"] == scene
-    assert (case["emitters"], case["sessions"], case["streams"]) == (3, 2, 2)
+    assert (case["emitters"], case["sessions"], case["streams"], case["listeners"]) == (3, 2, 2, listeners)
     assert case["errors"] == []
     # Late blocks and a reverberation that stands still are the machine's.
     assert outcome.exit_code == (case["late_share"] >= 0.001 or max(case["behind_s"]) > 5), outcome.output
     assert sum(case["quality_at_end"].values()) == 2
     assert 0 <= case["below_best_share"] <= 1
-    due = 2 * case["duration_s"] * sample_rate / 256
+    due = 2 * listeners * case["duration_s"] * sample_rate / 256
     assert case["blocks_sent"] + case["blocks_dropped"] + case["blocks_missing"] == pytest.approx(due, rel=0.05)
     assert 0 <= case["late_share"] <= 1
     for name in ("block_ms", "lateness_ms", "pose_to_audio_ms", "pose_to_reverberation_ms", "client_pose_to_audio_ms"):
