@@ -45,14 +45,18 @@ def listen(page, seconds: float = 1.0) -> np.ndarray:
     )
 
 
-@pytest.fixture
-def page(browser, server) -> Iterator:
-    """An empty page of the server's own, with the package as its users import it."""
-    context = browser.new_context()
+def empty_page(context, server: str):
+    """A page of the server's own without anything in it, with the package as its users import it."""
     page = context.new_page()
     page.goto(f"{server}/icon.svg")
     page.evaluate("import('/nafir/index.js').then((module) => (window.package = module))")
-    yield page
+    return page
+
+
+@pytest.fixture
+def page(browser, server) -> Iterator:
+    context = browser.new_context()
+    yield empty_page(context, server)
     context.close()
 
 
@@ -138,6 +142,32 @@ def test_listeners_of_an_ambisonic_stream_turn_by_themselves(page):
     behind = visitor.level_db(listen(page, 2.0))
     assert ahead[0] - ahead[1] > 2
     assert behind[1] - behind[0] > 2
+
+
+def test_a_connection_that_is_made_again_has_its_listeners_where_they_are_by_then(browser, server):
+    port, context = visitor.free_port(), browser.new_context()
+    with visitor.passing_on(port, server) as url:
+        page = empty_page(context, url)
+        connect(page, listener={"position": [2.5, 2.0, 1.5], "yaw": 0})
+        page.evaluate("""async () => {
+          window.second = await nafir.addListener({ position: [2.5, 4.0, 1.5], yaw: 0 });
+          second.output.connect(context.destination);
+          nafir.addEmitter({ clip: "woman-reading", position: [2.5, 3.0, 1.5] });
+        }""")
+        page.wait_for_function("second.latency.direct !== null")
+    page.wait_for_function("nafir.state === 'waiting'")
+    page.evaluate("second.position = [2.5, 2.0, 1.5]")
+    page.evaluate("() => void nafir.addListener({ id: 'late' }).then((late) => (window.late = late))")
+    with visitor.passing_on(port, server):
+        page.wait_for_function("window.late && nafir.state === 'live'", timeout=20_000)
+        page.evaluate("[window.first, window.nafir] = [nafir, second]")
+        page.wait_for_timeout(1000)
+        left, right = visitor.level_db(listen(page, 2.0))
+        assert left > -60
+        assert left - right > 1.5
+        assert page.evaluate("[...first.listeners.keys()]") == ["listener-2", "late"]
+        assert page.evaluate("refusals") == []
+        context.close()
 
 
 def test_the_sound_of_a_node_is_heard_from_its_place(page):
