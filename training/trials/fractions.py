@@ -74,7 +74,9 @@ class Scored:
 
 @dataclass(frozen=True)
 class Fractions:
-    """All scored trials on one dataset, and the errors of the floor: what two simulations of the pairs differ by."""
+    """All scored trials on one dataset, and the errors of the floor: what two simulations of the pairs differ by. That
+    is no limit: a field that has learned from many noisy responses is nearer to one of them than another of the same
+    pair is, because its own noise is less."""
 
     data: str
     effort: Effort

@@ -45,7 +45,8 @@ def figure_of(fractions: Fractions) -> Figure:
                 label=field,
             )
         if metric in fractions.floor:
-            axes.axhline(fractions.floor[metric], color="#8a8a8a", linestyle="--", label="two simulations (floor)")
+            repeated = fractions.floor[metric]
+            axes.axhline(repeated, color="#8a8a8a", linestyle="--", label="a second simulation (repeatability)")
         axes.set_xscale("log")
         percents = sorted({each.trial.percent for each in fractions.scored})
         axes.set_xticks(percents, [f"{percent:g}" for percent in percents])
@@ -54,5 +55,5 @@ def figure_of(fractions: Fractions) -> Figure:
         axes.set(xlabel="training pairs used (%)", ylabel=labels[metric])
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].legend(frameon=False, fontsize=9)
+    figure.axes[0].legend(frameon=False, fontsize=9, loc="lower left")
     return figure
