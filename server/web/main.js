@@ -36,6 +36,7 @@ const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
 const LONGEST_RETRY_MS = 30_000;
+const WORLDLY = ["listener", "emitter", "remove"]; // what a stream is told that is not heard yet
 
 const find = (id) => document.getElementById(id);
 const epochNow = () => performance.timeOrigin + performance.now();
@@ -67,6 +68,8 @@ class Page {
     this.remote = new WorkerStream(); // a server's stream
     this.local = null; // one that is rendered here, once it is wanted
     this.stream = this.remote; // the one that is heard
+    this.used = "auto"; // the level that was chosen for it
+    this.coming = null; // {stream, output, port}: one that is being prepared, to be heard in its place
     this.connection = "idle";
     this.playing = false;
     this.isFed = false; // whether the visitor's own sounds go into the stream
@@ -257,6 +260,8 @@ class Page {
     for (const [type, handle] of Object.entries(handlers)) {
       stream.addEventListener(type, ({ detail }) => this.stream === stream && handle(detail));
     }
+    stream.addEventListener("state", ({ detail }) => this.coming?.stream === stream && this.#comingState(detail));
+    stream.addEventListener("failed", ({ detail }) => this.coming?.stream === stream && this.#stay(detail));
   }
 
   #listenToControls() {
@@ -283,11 +288,16 @@ class Page {
         this.#tell("effects", detail);
         if (this.output !== null) this.output = this.#wantedOutput;
       }
+      this.#prepareAgain();
     });
-    this.turning.addEventListener("chosen", () => this.#renewed());
+    this.turning.addEventListener("chosen", () => {
+      this.#renewed();
+      this.#prepareAgain();
+    });
     this.heads.addEventListener("chosen", ({ detail }) => {
       if (this.output === "ambisonics") this.#listenWithHead();
       else this.#tell("renew", { head: detail });
+      this.#prepareAgain();
     });
     find("volume").addEventListener("input", ({ target }) => this.#setVolume(target.valueAsNumber));
     this.#setVolume(find("volume").valueAsNumber);
@@ -373,32 +383,108 @@ class Page {
     return this.stream === this.local;
   }
 
-  /** Takes the stream that the chosen level needs. */
-  #chooseStream() {
-    if (this.frontier.chosen !== HERE) this.stream = this.remote;
-    else {
-      if (!this.local) this.#listenToStream((this.local = new LocalWorkerStream()));
-      this.stream = this.local;
-    }
+  /** The stream that a level needs. */
+  #streamFor(level) {
+    if (level !== HERE) return this.remote;
+    if (!this.local) this.#listenToStream((this.local = new LocalWorkerStream()));
+    return this.local;
+  }
+
+  /** Takes a stream as the one that is heard. */
+  #choose(stream) {
+    this.stream = stream;
+    this.used = this.frontier.chosen;
     this.turning.level = this.#isHere ? "auto" : this.frontier.chosen;
-    this.panel.rendersHere = this.#isHere;
+    this.panel.rendersHere = this.turning.rendersHere = this.#isHere;
   }
 
   async #useLevel(name) {
-    if (this.#isHere || name === HERE) {
+    if (this.coming || this.#isHere || name === HERE) {
       await pause(SETTLED_MS);
       if (this.frontier.chosen !== name) return; // another was chosen meanwhile
     }
-    if (this.#isHere !== (name === HERE)) {
-      const wasPlaying = this.playing;
-      await this.pause();
-      this.#chooseStream();
-      if (wasPlaying) await this.play();
+    const stream = this.#streamFor(name);
+    this.#callOff();
+    if (stream !== this.stream) {
+      if (this.playing) this.#prepare(stream);
+      else this.#choose(stream);
       return;
     }
     if (this.#isHere) return;
-    this.turning.level = name;
+    this.turning.level = this.used = name;
     if (!this.#renewed({ level: name })) this.#tell("level", { name });
+  }
+
+  /** Opens a stream beside the one that is heard, which takes its place when it is there. */
+  #prepare(stream) {
+    const { port1, port2 } = new MessageChannel();
+    this.coming = { stream, ...this.#open(stream, port2), port: port1 };
+  }
+
+  /** Opens a stream that sends its blocks to a port. Returns the output that it has. */
+  #open(stream, port) {
+    const isHere = stream === this.local;
+    // The menu of turning knows of the level that is heard alone.
+    const isTurnedHere = isHere || (this.turning.turns(this.frontier.chosen) && this.effects.wishes.output !== "mono");
+    const output = isTurnedHere ? "ambisonics" : this.effects.wishes.output;
+    const hello = {
+      scene: this.scene.id,
+      sampleRate: this.scene.sample_rate,
+      level: isHere ? undefined : this.frontier.chosen,
+      effects: this.effects.wishes.effects,
+      ...this.#outputOf(output),
+    };
+    const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
+    stream.tell("open", { url: streamUrl(), key: key(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
+    return { output };
+  }
+
+  #prepareAgain() {
+    if (!this.coming) return;
+    const { stream } = this.coming;
+    this.#callOff();
+    this.#prepare(stream);
+  }
+
+  #callOff() {
+    if (!this.coming) return;
+    const { stream, port } = this.coming;
+    this.coming = null;
+    stream.tell("close");
+    port.close();
+  }
+
+  /** Goes on with what is heard, because what was to come cannot. */
+  #stay(reason) {
+    this.#callOff();
+    this.frontier.chosen = this.used;
+    this.notices.show("stream", reason);
+  }
+
+  #comingState(detail) {
+    const { state, reason, isBusy } = detail;
+    if (state === "refused") this.#stay(reason);
+    else if (state === "waiting" && isBusy) this.notices.show("connection", "The server has no room yet. What you hear goes on until it has.");
+    else if (state === "live") this.#adopt(detail);
+  }
+
+  /** Plays the stream that has come, in place of the one that was heard. */
+  #adopt(detail) {
+    const { stream, output, port } = this.coming;
+    this.coming = null;
+    const before = this.stream;
+    this.#starve();
+    this.#choose(stream);
+    this.player.take(port);
+    before.tell("close");
+    this.output = output;
+    this.#blank();
+    this.steady = false;
+    // It counts its poses anew.
+    [this.ledger, this.reverberationLedger] = [new PoseLedger(), new PoseLedger()];
+    if (output === "ambisonics") this.#listenWithHead();
+    this.#feedAll();
+    this.#streamState(detail);
   }
 
   #useDry(isDry) {
@@ -428,7 +514,7 @@ class Page {
     this.effects.restore(shared);
     this.heads.used = this.turning.used = this.effects.wishes.output !== "mono";
     this.turning.chosen = shared.turning;
-    this.#chooseStream();
+    this.#choose(this.#streamFor(this.frontier.chosen));
   }
 
   async #share() {
@@ -465,24 +551,25 @@ class Page {
 
   #tell(type, detail, transfer = []) {
     this.stream.tell(type, detail, transfer);
+    if (WORLDLY.includes(type)) this.coming?.stream.tell(type, detail);
   }
 
   get #wantedOutput() {
-    return this.turning.isHere || this.#isHere ? "ambisonics" : this.effects.wishes.output;
+    return this.turning.isHere ? "ambisonics" : this.effects.wishes.output;
   }
 
-  /** What a hello says of the output. Ambisonic sound is decoded here, whatever head the server has. */
-  #outputNow() {
-    this.output = this.#wantedOutput;
-    const isHere = this.output === "ambisonics";
-    return { output: this.output, order: isHere ? ORDER : undefined, head: isHere ? undefined : this.heads.chosen };
+  /** What a hello says of an output. Ambisonic sound is decoded here, whatever head the server has. */
+  #outputOf(output) {
+    const isHere = output === "ambisonics";
+    return { output, order: isHere ? ORDER : undefined, head: isHere ? undefined : this.heads.chosen };
   }
 
   /** Begins another stream if only that can have the output that is wanted now. Returns whether it does. */
   #renewed(changes = {}) {
     const crosses = this.output !== this.#wantedOutput && [this.output, this.#wantedOutput].includes("ambisonics");
     if (!this.playing || this.output === null || !crosses) return false;
-    this.#tell("renew", { ...changes, effects: this.effects.wishes.effects, ...this.#outputNow() });
+    this.output = this.#wantedOutput;
+    this.#tell("renew", { ...changes, effects: this.effects.wishes.effects, ...this.#outputOf(this.output) });
     if (this.output === "ambisonics") this.#listenWithHead();
     return true;
   }
@@ -533,24 +620,22 @@ class Page {
     }
     if (!this.playing) return;
     this.notices.clear("audio");
-    this.#chooseStream();
-    const hello = {
-      scene: this.scene.id,
-      sampleRate: this.scene.sample_rate,
-      level: this.#isHere ? undefined : this.frontier.chosen,
-      effects: this.effects.wishes.effects,
-      ...this.#outputNow(),
-    };
+    this.#choose(this.#streamFor(this.frontier.chosen));
+    this.#feedAll();
+    this.output = this.#open(this.stream, port).output;
     if (this.output === "ambisonics") this.#listenWithHead();
+  }
+
+  /** Plays the visitor's own sounds into the stream that is heard. */
+  #feedAll() {
     this.isFed = true;
     for (const emitter of this.world.emitters.values()) this.#feed(emitter);
-    const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
-    this.#tell("open", { url: streamUrl(), key: key(), hello, listener: this.#listenerNow(), emitters, port }, [port]);
   }
 
   async pause() {
     if (!this.playing) return;
     this.#setPlaying(false);
+    this.#callOff();
     this.#starve();
     await this.player.pause();
     if (this.playing) return;
@@ -619,6 +704,7 @@ class Page {
     } else if (state === "refused") {
       if (!needsKey) this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);
+      this.#callOff();
       this.#starve();
       const paused = this.player.pause();
       this.output = null;

@@ -32,6 +32,11 @@ export class Player extends EventTarget {
     return port;
   }
 
+  /** Plays what comes from a port from now on; see Output. */
+  take(port) {
+    this.#output.take(port);
+  }
+
   async #build() {
     this.#context.onstatechange = () => {
       if (this.#wanted && this.#started && this.#context.state !== "running") this.dispatchEvent(new Event("interrupted"));

@@ -3,6 +3,7 @@
 
 const NO_DIRECTIONS = "This scene knows what two ears hear, and not from where sound arrives.";
 const LEVEL_WITHOUT = "This quality level knows what two ears hear, and not from where sound arrives.";
+const RENDERED_HERE = "What is rendered in this browser is turned in it.";
 const NO_HEAD = "One loudspeaker is the same wherever the head looks.";
 
 export class Turning extends EventTarget {
@@ -12,6 +13,7 @@ export class Turning extends EventTarget {
   #levels = []; // of the scene, those that know directions
   #level = "auto";
   #isUsed = true;
+  #isRenderedHere = false;
 
   /** `choice` is the menu. */
   constructor(choice) {
@@ -32,7 +34,12 @@ export class Turning extends EventTarget {
 
   /** Whether the browser is to turn the sound. */
   get isHere() {
-    return this.#choice.value === "browser" && this.#isUsed;
+    return this.#isRenderedHere || (this.#choice.value === "browser" && this.#isUsed);
+  }
+
+  /** Whether the browser is to turn the sound of a quality level. */
+  turns(level) {
+    return this.isPossible && (level === "auto" || this.#levels.includes(level)) && this.#wish === "browser";
   }
 
   /** What was chosen: "browser" or "server"; undefined if nothing was. */
@@ -66,6 +73,12 @@ export class Turning extends EventTarget {
     this.#show();
   }
 
+  /** Whether the sound is rendered in this browser and not on the server. */
+  set rendersHere(isHere) {
+    this.#isRenderedHere = isHere;
+    this.#show();
+  }
+
   /** Whether the output is headphones. */
   set used(isUsed) {
     this.#isUsed = isUsed;
@@ -79,10 +92,16 @@ export class Turning extends EventTarget {
   }
 
   #show() {
+    if (this.#isRenderedHere) {
+      this.#choice.disabled = true;
+      this.#choice.value = "browser";
+      this.#choice.title = RENDERED_HERE;
+      return;
+    }
     const { isPossible } = this;
     const isOfLevel = this.#level === "auto" || this.#levels.includes(this.#level);
     this.#choice.disabled = !isPossible || !isOfLevel || !this.#isUsed;
-    this.#choice.value = isPossible && isOfLevel ? this.#wish : "server";
+    this.#choice.value = this.turns(this.#level) ? "browser" : "server";
     this.#choice.title = !isPossible ? NO_DIRECTIONS : !isOfLevel ? LEVEL_WITHOUT : !this.#isUsed ? NO_HEAD : "";
   }
 }

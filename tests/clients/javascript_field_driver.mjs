@@ -11,7 +11,7 @@ const { Field, readRows } = await load("field.js");
 const { Network } = await load("network.js");
 const { inverse, transform } = await load("fourier.js");
 const { LocalStream, BLOCK } = await load("local_stream.js");
-const { spectraOf } = await load("renderer.js");
+const { Convolver, spectraOf } = await load("renderer.js");
 const bytesOf = (path) => new Uint8Array(readFileSync(path));
 
 const open = ({ bundle, graph, noises, level }) =>
@@ -69,17 +69,36 @@ function answerer(field, stream) {
   };
 }
 
-/** Renders blocks; `script` has the commands before a block, by its number. The clip is a file of float32. */
-function stream({ blocks, script, clip, into, ...opened }) {
+/** Renders blocks; `script` has the commands before a block, by its number. The clip is a file of float32, and comes after `soundAfter` ticks. */
+function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
   const field = open(opened);
   const told = { posed: [], refused: [], state: [], status: [], heard: [] };
   const samples = new Float32Array(4 * blocks * BLOCK);
   let time = 1000;
+  const { process } = Convolver.prototype;
+  let convolved = 0; // in this block
+  let most = 0; // in any
+  Convolver.prototype.process = function (...given) {
+    convolved += 1;
+    return process.apply(this, given);
+  };
+  function obey(commands) {
+    for (const { listener: moved, emitter, remove, feed, wait } of commands) {
+      if (moved) local.setListener({ ...moved, at: time });
+      if (emitter) local.setEmitter({ ...emitter, at: time });
+      if (remove) local.removeEmitter(remove);
+      if (feed) local.feed(feed.id, Float32Array.from(feed.samples));
+      if (wait) time += wait;
+    }
+  }
   let rendered = 0;
   const block = ({ channels, poseId, reverberationPoseId, late }) => {
     told.heard.push([poseId, reverberationPoseId, late]);
-    channels.forEach((channel, k) => samples.set(channel, k * blocks * BLOCK + rendered * BLOCK));
+    if (rendered < blocks) channels.forEach((channel, k) => samples.set(channel, k * blocks * BLOCK + rendered * BLOCK));
     rendered += 1;
+    if (rendered > 1) most = Math.max(most, convolved); // what was rehearsed comes before the first
+    convolved = 0;
+    obey(script[rendered] ?? []);
   };
   const keep = (name) => (detail) => told[name].push(detail);
   const listeners = { block, posed: keep("posed"), refused: keep("refused"), state: keep("state"), status: keep("status") };
@@ -93,21 +112,17 @@ function stream({ blocks, script, clip, into, ...opened }) {
     tell: (message) => (local ? answer(message) : waiting.push(message)),
   });
   waiting.forEach(answer);
-  if (clip) local.setSound({ name: "clip", samples: new Float32Array(bytesOf(clip).buffer) });
-  for (let number = 0; number < blocks; number++) {
-    for (const { listener: moved, emitter, remove, feed, wait } of script[number] ?? []) {
-      if (moved) local.setListener({ ...moved, at: time });
-      if (emitter) local.setEmitter({ ...emitter, at: time });
-      if (remove) local.removeEmitter(remove);
-      if (feed) local.feed(feed.id, Float32Array.from(feed.samples));
-      if (wait) time += wait;
-    }
+  let ticks = 0;
+  let begun = null; // the tick before the first block
+  for (obey(script[0]); rendered < blocks && ticks < 10 * blocks + 1000; ticks++) {
+    if (clip && ticks === soundAfter) local.setSound({ name: "clip", samples: new Float32Array(bytesOf(clip).buffer) });
     local.tick();
+    if (rendered > 0) begun ??= { ticks, atOnce: rendered };
     time += (1000 * BLOCK) / field.sampleRate;
-    if (rendered >= blocks) break;
   }
+  Convolver.prototype.process = process;
   writeFileSync(into, samples);
-  return { ...told, block: BLOCK, rendered };
+  return { ...told, block: BLOCK, rendered, begun, most };
 }
 
 const TASKS = { respond, run, spectrum, stream };

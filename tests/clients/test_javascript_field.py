@@ -344,7 +344,9 @@ def render(work, tmp_path):
     field = AcousticField.load(bundle, level="directional-bands")
     (tmp_path / "noises.npy").write_bytes(noise_file(field, 1))
 
-    def blocks(count: int, script: dict[int, list[dict[str, Any]]], clip: np.ndarray | None = None) -> Rendered:
+    def blocks(
+        count: int, script: dict[int, list[dict[str, Any]]], clip: np.ndarray | None = None, **more: Any
+    ) -> Rendered:
         if clip is not None:
             clip.astype("<f4").tofile(tmp_path / "clip.f32")
         job = {
@@ -356,6 +358,7 @@ def render(work, tmp_path):
             "script": script,
             "clip": None if clip is None else str(tmp_path / "clip.f32"),
             "into": str(tmp_path / "blocks.f32"),
+            **more,
         }
         [said] = work([job])
         assert "error" not in said, said
@@ -431,6 +434,52 @@ def test_emitters_come_play_and_go(render):
     assert level[259] == 0
 
 
+def test_nothing_is_heard_before_every_emitter_has_its_sound_and_its_response(render):
+    here, _, source = HERE_AND_THERE
+    clip = np.random.default_rng(6).standard_normal(40 * 256) * 0.1
+    found = render(40, {0: [standing(here), radio(source)]}, clip, soundAfter=50)
+    assert found.said["begun"]["ticks"] == 50
+    # What a player needs to begin is there at once.
+    assert found.said["begun"]["atOnce"] * 256 >= 0.115 * 24_000
+    assert [state["state"] for state in found.said["state"]] == ["connecting", "live"]
+    assert not any(is_late for _, _, is_late in found.said["heard"])
+    expected = heard_of(clip, render.response(here, source), 40 * 256)
+    assert np.abs(found.samples - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+def test_a_sound_that_never_comes_is_not_waited_for_without_end(render):
+    here, _, source = HERE_AND_THERE
+    found = render(20, {0: [standing(here), radio(source)]}, np.full(256, 0.1), soundAfter=10**6)
+    assert found.said["begun"]["ticks"] * 256 / 24_000 == pytest.approx(4, abs=0.05)
+    assert not found.samples.any()
+
+
+def test_emitters_that_have_left_cost_so_much_and_no_more(render):
+    here, _, source = HERE_AND_THERE
+    names = [f"emitter-{number}" for number in range(8)]
+    script: dict[int, list[dict[str, Any]]] = {
+        number: [
+            *({"remove": name} for name in names if number > 0),
+            *({"emitter": radio(source)["emitter"] | {"id": name}} for name in names),
+        ]
+        for number in range(60)
+    }
+    script[0].insert(0, standing(here))
+    assert render(60, script, np.full(256, 0.01)).said["most"] == 3 * len(names)
+
+
+def test_an_emitter_that_leaves_after_many_others_makes_no_click(render):
+    here, _, source = HERE_AND_THERE
+    tone = np.sin(2 * np.pi * 200 * np.arange(100 * 256) / 24_000)
+    silent = [{"emitter": {"id": f"silent-{number}", "position": list(source)}} for number in range(7)]
+    gone = [{"remove": each["emitter"]["id"]} for each in silent]
+    script = {0: [standing(here), radio(source), *silent], 40: [{"remove": "radio"}], 41: gone, 42: silent, 43: gone}
+    samples = render(60, script, tone).samples[:, 30 * 256 : 50 * 256]
+    curvature = np.abs(np.diff(samples, 2)).max()
+    assert curvature < 2.5 * np.abs(samples).max() * (2 * np.pi * 200 / 24_000) ** 2
+    assert np.abs(samples[:, -256:]).max() == 0  # it has faded with the block after
+
+
 def test_what_a_stream_refuses_is_said_and_it_goes_on(render):
     here, _, source = HERE_AND_THERE
     script = {
@@ -450,9 +499,9 @@ def test_what_a_stream_refuses_is_said_and_it_goes_on(render):
 
 def test_blocks_that_are_much_too_late_are_left_out(render):
     here, _, source = HERE_AND_THERE
-    script = {0: [standing(here), radio(source)], 10: [{"wait": 50}], 30: [{"wait": 5000}]}
+    script = {0: [standing(here), radio(source)], 20: [{"wait": 50}], 40: [{"wait": 5000}]}
     found = render(160, script, np.full(256, 0.1))
     late = [is_late for _, _, is_late in found.said["heard"]]
-    assert sum(late[10:30]) in {4, 5}  # of 50 ms: they are rendered at once
+    assert sum(late[20:40]) in {4, 5}  # of 50 ms: they are rendered at once
     assert len(found.said["status"]) > 0
     assert found.said["status"][-1]["blocks_dropped"] == pytest.approx(5 * 24_000 / 256, abs=3)

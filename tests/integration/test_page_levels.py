@@ -95,6 +95,14 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     context.close()
 
 
+FOLLOW_CONNECTION = """() => {
+  const shown = document.getElementById("connection");
+  window.followed = [shown.dataset.state];
+  new MutationObserver(() => shown.dataset.state !== followed.at(-1) && followed.push(shown.dataset.state))
+    .observe(shown, { attributes: true });
+}"""
+
+
 def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_levels):
     def wait_for_streams(wanted: int) -> None:  # those of pages that have gone end in their time
         for _ in range(100):
@@ -111,13 +119,24 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     context.on("weberror", lambda error: complaints.append(str(error.error)))
     page = open_page(context, several_levels)
     start(page)
+    page.select_option("#turning", "server")
+    page.wait_for_function("nafir.state().output === 'headphones' && nafir.state().latency !== null")
+    page.evaluate(FOLLOW_CONNECTION)
     page.select_option("#level-choice", "in-this-browser")
-    page.wait_for_function("nafir.state().level === 'in-this-browser' && nafir.state().latency !== null")
+    page.wait_for_function("nafir.state().level === 'in-this-browser'")
+    page.wait_for_function("nafir.state().latency !== null")
+    # The server was heard until the browser's own stream was there, which was rendered in time from its beginning.
+    assert page.evaluate("followed") == ["live"]
+    assert page.evaluate("nafir.state().playing")
     assert page.inner_text("#level") == "In this browser"
     page.wait_for_function("document.getElementById('field-cost').textContent.endsWith(' ms')")
     assert page.locator("#frontier .in-browser.heard").count() == 1
     assert re.fullmatch(r"[0-9.]+\sms\shere", page.inner_text("#level-note"))
     assert page.inner_text("#part-server-name") == "This browser"
+    turning = page.locator("#turning")
+    assert turning.input_value() == "browser"
+    assert turning.is_disabled()
+    assert turning.get_attribute("title") == "What is rendered in this browser is turned in it."
     assert level_db(listen(page)).max() > -60
     # A step is heard, without the server.
     page.evaluate("nafir.setListener({ x: 2.6 })")
@@ -127,6 +146,9 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
 
     page.select_option("#level-choice", "standard")
     page.wait_for_function("nafir.state().level === 'standard'")
+    assert page.evaluate("followed") == ["live"]
+    assert turning.is_enabled()
+    assert turning.input_value() == "server"
     assert page.inner_text("#part-server-name") == "Server and network"
     assert page.locator("#frontier .in-browser.heard").count() == 0
     wait_for_streams(1)

@@ -132,32 +132,3 @@ def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(one_page):
     run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": delays})
     assert run["underruns"][-1] == run["underruns"][len(run["underruns"]) // 4] <= 5
     assert run["steepest"] < 1.5 * STEEPEST_TONE
-
-
-RESTART = """async () => {
-  const { JitterBuffer } = await import(new URL("nafir/jitterbuffer.js", document.baseURI));
-  const buffer = new JitterBuffer({ sampleRate: 24_000 });
-  const samples = (value) => new Float32Array(24_000).fill(value);
-  const played = [];
-  const pull = (quanta) => {
-    for (let i = 0; i < quanta; i++) {
-      const ears = [new Float32Array(128), new Float32Array(128)];
-      buffer.pull(ears);
-      played.push(ears.map((ear) => Array.from(ear)));
-    }
-  };
-  buffer.push({ channels: [samples(0.5), samples(-0.5)], sampleClock: 0, poseId: 0, late: false });
-  pull(20);
-  buffer.reset();
-  pull(5);
-  return [0, 1].map((ear) => played.flatMap((quantum) => quantum[ear]));
-}"""
-
-
-def test_a_stream_that_is_followed_by_another_fades_out(one_page):
-    """As where another head is chosen: sound at 0.5 does not stop from one sample to the next."""
-    left, right = np.asarray(one_page.evaluate(RESTART))
-    assert left[20 * 128 - 1] == 0.5
-    assert np.abs(np.diff(left[128:])).max() < 0.5 * math.pi / 64
-    assert np.all(left[21 * 128 :] == 0)
-    np.testing.assert_array_equal(left, -right)

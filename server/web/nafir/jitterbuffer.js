@@ -39,12 +39,7 @@ export class JitterBuffer {
     this.capacity = Math.round(sampleRate * capacityS);
     this.rings = Array.from({ length: channels }, () => new Float32Array(this.capacity));
     this.counters = { underruns: 0, splices: 0, gaps: 0, overflows: 0, late: 0, blocks: 0 };
-    this.reset();
-  }
-
-  /** Drops the audio and starts filling again. Counters are kept. */
-  reset() {
-    this.ending = this.playing && this.fill >= RESERVE ? this.#faded() : null;
+    this.isEnding = false; // whether nothing more comes: that it runs dry is no dropout then
     this.read = 0;
     this.written = 0;
     this.playing = false;
@@ -60,14 +55,6 @@ export class JitterBuffer {
     this.newestReverberationPose = -1;
     this.dips = []; // {lowest, seconds} of each window of the last MEMORY_S since playing began
     this.#openWindow();
-  }
-
-  /** The next samples with a fade-out, so that a stream that ends does not end in a click. */
-  #faded() {
-    const rest = this.rings.map(() => new Float32Array(RESERVE));
-    this.#copy(rest, RESERVE);
-    this.#ramp(rest, FADE, 0, true);
-    return rest;
   }
 
   #openWindow(seconds = WINDOW_S) {
@@ -132,11 +119,7 @@ export class JitterBuffer {
       return this.#heard(frames);
     }
     if (!this.playing) {
-      outputs.forEach((samples, index) => {
-        samples.fill(0);
-        if (this.ending) samples.set(this.ending[index]);
-      });
-      this.ending = null;
+      for (const samples of outputs) samples.fill(0);
       return [];
     }
     if (this.fill < frames + RESERVE) return this.#runDry(outputs, frames);
@@ -172,6 +155,7 @@ export class JitterBuffer {
     const start = Math.max(0, rest - RESERVE);
     this.#ramp(last, FADE.subarray(0, rest - start), start, true);
     this.playing = false;
+    if (this.isEnding) return this.#heard(rest);
     this.counters.underruns += 1;
     this.grownS = Math.min(MAX_HEADROOM_S, this.grownS + GROWTH_S);
     this.headroomS = Math.min(MAX_HEADROOM_S, this.headroomS + GROWTH_S);

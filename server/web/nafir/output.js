@@ -28,8 +28,14 @@ export class Output extends EventTarget {
   /** A port that takes audio blocks, in place of any before. */
   connect() {
     const { port1, port2 } = new MessageChannel();
-    this.node.port.postMessage({ type: "connect", port: port1 }, [port1]);
+    this.take(port1);
     return port2;
+  }
+
+  /** Takes audio blocks from a port, those that wait there first, in place of any before. A stream that begins anew there is heard once
+      enough of it has arrived, and what is there of the one before until then. */
+  take(port) {
+    this.node.port.postMessage({ type: "connect", port }, [port]);
   }
 
   /** What takes the sound of a live emitter: {node, port, end()}. `node` is the AudioNode to connect to, and its sound comes out of `port`,

@@ -10,16 +10,30 @@ const BLOCK = 256; // samples of a live emitter that are sent at once
 const REPORT_QUANTA = 5; // about 27 ms at 24 kHz
 const TAP_S = 12;
 
+/** The playback of a stream of ambisonics of this order, or of two ears if it is null. `channels` are what its buffer gave last. */
+function playing(order) {
+  const decoder = order === null ? null : new HeadDecoder({ order, frames: QUANTUM });
+  const count = decoder?.channels ?? 2;
+  const channels = Array.from({ length: count }, () => new Float32Array(QUANTUM));
+  return { decoder, channels, buffer: new JitterBuffer({ sampleRate, channels: count }) };
+}
+
+/** Fills both ears from a playback. Returns the poses that become audible. */
+function pull({ buffer, decoder, channels }, left, right) {
+  if (!decoder) return buffer.pull([left, right]);
+  const heard = buffer.pull(channels);
+  decoder.decode(channels, left, right);
+  return heard;
+}
+
 class NafirPlayer extends AudioWorkletProcessor {
   constructor() {
     super();
-    this.buffer = new JitterBuffer({ sampleRate });
-    this.channels = null; // what the buffer gave last, of an ambisonic stream
-    this.decoder = null; // of an ambisonic stream
+    this.present = playing(null); // the stream that is heard
+    this.next = null; // one that is heard as soon as its buffer is filled
     this.filters = null; // of the head; {filters, delaySamples}
     this.orientation = [0, 0, 0, 1];
     this.turns = []; // {id, at, saidAt}: turns that the next quantum is the first to have
-    this.ending = null; // last quantum of a stream that had other channels
     this.tap = [new Float32Array(TAP_S * sampleRate), new Float32Array(TAP_S * sampleRate)];
     this.tapped = 0; // samples written to the tap since the start
     this.isOpen = true;
@@ -34,7 +48,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     if (data.type === "connect") {
       this.feed?.close();
       this.feed = data.port;
-      this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : this.buffer.push(block));
+      this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : (this.next ?? this.present).buffer.push(block));
     } else if (data.type === "end") {
       this.isOpen = false;
       this.feed?.close();
@@ -42,39 +56,39 @@ class NafirPlayer extends AudioWorkletProcessor {
       this.#capture(data);
     } else if (data.type === "head") {
       this.filters = data;
-      this.decoder?.use(data.filters);
+      for (const { decoder } of this.#streams) decoder?.use(data.filters);
     } else if (data.type === "turn") {
       this.orientation = data.orientation;
-      this.decoder?.turn(data.orientation);
+      for (const { decoder } of this.#streams) decoder?.turn(data.orientation);
       this.turns.push(data);
     }
   }
 
-  /** Makes ready for a stream of ambisonics of this order, or of two ears if it is null. */
+  get #streams() {
+    return this.next ? [this.present, this.next] : [this.present];
+  }
+
+  /** Makes ready for a stream of ambisonics of this order, or of two ears if it is null. What is there of the present one is played until
+      the next has filled its buffer. */
   #restart(order) {
-    if (order === (this.decoder?.order ?? null)) {
-      this.buffer.reset();
-      return;
-    }
-    const { counters } = this.buffer;
-    this.buffer.reset();
-    this.ending = [new Float32Array(QUANTUM), new Float32Array(QUANTUM)];
-    this.#pull(...this.ending);
-    this.decoder = order === null ? null : new HeadDecoder({ order, frames: QUANTUM });
-    const channels = this.decoder?.channels ?? 2;
-    this.channels = Array.from({ length: channels }, () => new Float32Array(QUANTUM));
-    this.buffer = new JitterBuffer({ sampleRate, channels });
-    Object.assign(this.buffer.counters, counters);
-    if (!this.decoder) return;
-    this.decoder.turn(this.orientation);
-    if (this.filters) this.decoder.use(this.filters.filters);
+    this.present.buffer.isEnding = true;
+    this.next = playing(order);
+    this.next.decoder?.turn(this.orientation);
+    if (this.filters) this.next.decoder?.use(this.filters.filters);
   }
 
   /** Fills both ears. Returns the poses that become audible. */
   #pull(left, right) {
-    if (!this.decoder) return this.buffer.pull([left, right]);
-    const heard = this.buffer.pull(this.channels);
-    this.decoder.decode(this.channels, left, right);
+    const { buffer } = this.next ?? this.present;
+    if (!this.next || buffer.fill < buffer.target) return pull(this.present, left, right);
+    const last = [new Float32Array(QUANTUM), new Float32Array(QUANTUM)];
+    pull(this.present, ...last);
+    for (const [name, count] of Object.entries(this.present.buffer.counters)) buffer.counters[name] += count;
+    [this.present, this.next] = [this.next, null];
+    const heard = pull(this.present, left, right);
+    [left, right].forEach((samples, ear) => {
+      for (let i = 0; i < QUANTUM; i++) samples[i] += last[ear][i] * (0.5 + 0.5 * Math.cos((Math.PI * (i + 0.5)) / QUANTUM));
+    });
     return heard;
   }
 
@@ -92,10 +106,9 @@ class NafirPlayer extends AudioWorkletProcessor {
 
   process(_inputs, [output]) {
     const heard = this.#pull(output[0], output[1]);
-    if (this.ending) output.forEach((samples, ear) => samples.forEach((_, i) => (samples[i] += this.ending[ear][i])));
-    this.ending = null;
     this.#tellTurns();
-    for (const { offset, fill, ...poses } of heard) {
+    // Poses of a stream that ends are not those of the next, which counts its own.
+    for (const { offset, fill, ...poses } of this.present.buffer.isEnding ? [] : heard) {
       this.port.postMessage({ type: "heard", ...poses, time: currentTime + offset / sampleRate, bufferedS: fill / sampleRate });
     }
     output.forEach((samples, ear) => this.#measure(samples, ear));
@@ -110,7 +123,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     if (this.turns.length === 0) return;
     const turns = this.turns;
     this.turns = [];
-    if (!this.decoder || !this.buffer.playing) return;
+    if (!this.present.decoder || !this.present.buffer.playing) return;
     const time = currentTime + (this.filters?.delaySamples ?? 0) / sampleRate;
     const now = Date.now();
     this.port.postMessage({ type: "turned", time, turns: turns.map(({ at, saidAt }) => ({ at, heldMs: Math.max(0, now - saidAt) })) });
@@ -128,13 +141,13 @@ class NafirPlayer extends AudioWorkletProcessor {
   }
 
   #report(frames) {
-    const { buffer } = this;
+    const { buffer } = this.present;
     this.port.postMessage({
       type: "report",
       time: currentTime,
       fillS: buffer.fill / sampleRate,
       targetS: buffer.target / sampleRate,
-      playing: buffer.playing,
+      playing: buffer.playing && !buffer.isEnding,
       started: buffer.started,
       peak: [...this.peak],
       rms: this.power.map((power) => Math.sqrt(power / (REPORT_QUANTA * frames))),

@@ -12,6 +12,10 @@ const STATUS_MS = 1000;
 const REST_MS = 1000; // the pose of a listener at rest counts as new this often, so that the measured latency stays current
 const SHORTEST_S = 0.1; // of the delay line
 const MEASURED = 40; // responses
+const MOST_LEAVING = 8; // emitters that ring out; of more, the first fade out in a block
+const REHEARSED = 16; // blocks in a row that have to be in time before anything is heard: code that runs for the first time is slow
+const PATIENCE_MS = 4000; // after which it is heard all the same
+const LEAD_S = 0.13; // of blocks at the beginning that are there at once, so that a player can begin at once
 
 const amplitudeOf = (gainDb = 0) => 10 ** (gainDb / 20);
 const samePlace = (one, other) => one.every((at, axis) => at === other[axis]);
@@ -21,6 +25,7 @@ class LocalEmitter {
   #direct;
   #convolver;
   #input = new Float32Array(BLOCK);
+  #silence = new Float32Array(BLOCK);
   #amplitude = null; // null before the first block
   wanted = {}; // what the page wants of it
   asked = -1; // newest pose for which the field was asked
@@ -42,6 +47,22 @@ class LocalEmitter {
 
   exchange(spectra) {
     return this.#convolver.exchange(spectra);
+  }
+
+  /** Whether a listener would wait for nothing but its sound. */
+  get isPrepared() {
+    return this.hasResponse >= 0 && this.source.isReady;
+  }
+
+  /** Whether it has been heard, so that it has something to ring out. */
+  get hasSounded() {
+    return this.#amplitude !== null;
+  }
+
+  /** Does the work of a block without its sound. Returns spectra that are no longer needed, or null. */
+  rehearse(channels) {
+    this.#direct.process(this.#silence, channels);
+    return this.#convolver.process(this.#silence, channels);
   }
 
   end() {
@@ -66,15 +87,21 @@ export class LocalStream {
   #now;
   #sampleRate;
   #shape = null; // of responses, once the field is there
+  #level = null; // its name, likewise
   #listener;
   #wanted = new Map(); // id -> what the page wants of an emitter
   #emitters = new Map(); // id -> LocalEmitter
-  #leaving = new Set();
+  #leaving = new Set(); // those that ring out, the first to leave first
+  #fading = []; // those that fade out with the next block
   #clips = new Map(); // name -> samples
   #poseId = 0;
   #posedAt = 0;
+  #isHeard = false;
+  #openedAt = 0;
   #startedAt = 0;
   #rendered = 0; // blocks, since startedAt
+  #inTime = 0; // of those that were rehearsed last
+  #unheard = Array.from({ length: CHANNELS }, () => new Float32Array(BLOCK));
   #sequence = 0;
   #late = 0;
   #dropped = 0;
@@ -114,14 +141,39 @@ export class LocalStream {
   #opened({ level, ms, ...shape }) {
     this.#costs.push(ms);
     this.#shape = { ...shape, sampleRate: this.#sampleRate };
-    const welcome = {
-      type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: BLOCK, channels: CHANNELS, encoding: "f32", level,
-      order: 1, max_emitters: MOST_EMITTERS,
-    };
-    this.#startedAt = this.#toldAt = this.#now();
-    this.#listeners.state({ state: "live", welcome });
+    this.#level = level;
+    this.#openedAt = this.#startedAt = this.#now();
     this.setListener({ ...this.#listener, at: this.#now() });
     for (const emitter of this.#wanted.values()) this.setEmitter(emitter);
+  }
+
+  /** Renders silence until blocks are in time, and every emitter has its sound and its first response. */
+  #rehearse(now) {
+    const due = this.#dueAt(now);
+    if (due > this.#rendered) {
+      this.#inTime = due - this.#rendered > 1 ? 0 : this.#inTime + 1;
+      this.#rendered = due;
+      for (const emitter of this.#emitters.values()) this.#giveBack(emitter.rehearse(this.#unheard));
+    }
+    const isPrepared = this.#inTime >= REHEARSED && [...this.#emitters.values()].every((emitter) => emitter.isPrepared);
+    if (isPrepared || now - this.#openedAt > PATIENCE_MS) this.#begin();
+  }
+
+  #begin() {
+    this.#isHeard = true;
+    const welcome = {
+      type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: BLOCK, channels: CHANNELS, encoding: "f32",
+      level: this.#level, order: 1, max_emitters: MOST_EMITTERS,
+    };
+    this.#listeners.state({ state: "live", welcome });
+    this.setListener({ ...this.#listener, at: this.#now() });
+    for (let lead = Math.ceil((LEAD_S * this.#sampleRate) / BLOCK); lead > 0; lead--) this.#listeners.block(this.#render(false));
+    this.#startedAt = this.#toldAt = this.#now();
+    this.#rendered = 1; // the last of them is the one that is due now
+  }
+
+  #dueAt(now) {
+    return Math.floor((((now - this.#startedAt) / 1000) * this.#sampleRate) / BLOCK) + 1;
   }
 
   #failed({ code, message, needsKey }) {
@@ -197,7 +249,7 @@ export class LocalStream {
 
   /** Takes the next mono samples of a live emitter. */
   feed(id, samples) {
-    this.#emitters.get(id)?.source.feed?.(samples);
+    if (this.#isHeard) this.#emitters.get(id)?.source.feed?.(samples);
   }
 
   removeEmitter(id) {
@@ -209,8 +261,13 @@ export class LocalStream {
     const emitter = this.#emitters.get(id);
     this.#emitters.delete(id);
     this.#tell({ type: "remove", id });
+    if (!emitter.hasSounded) return;
     emitter.end();
     this.#leaving.add(emitter);
+    if (this.#leaving.size <= MOST_LEAVING) return;
+    const [first] = this.#leaving;
+    this.#leaving.delete(first);
+    this.#fading.push(first);
   }
 
   /** Renders the blocks that are due. Call it often. */
@@ -218,7 +275,11 @@ export class LocalStream {
     if (!this.#shape) return;
     const now = this.#now();
     if (now - this.#posedAt >= REST_MS) this.setListener({ ...this.#listener, at: now });
-    const due = Math.floor((((now - this.#startedAt) / 1000) * this.#sampleRate) / BLOCK) + 1;
+    if (!this.#isHeard) {
+      this.#rehearse(now);
+      return;
+    }
+    const due = this.#dueAt(now);
     const most = Math.ceil((BEHIND_S * this.#sampleRate) / BLOCK);
     if (due - this.#rendered > most) {
       this.#dropped += due - this.#rendered - 1;
@@ -247,6 +308,11 @@ export class LocalStream {
       this.#giveBack(emitter.process(channels));
       emitter.ending -= 1;
       if (emitter.ending <= 0) this.#leaving.delete(emitter);
+    }
+    for (const emitter of this.#fading.splice(0)) {
+      for (const channel of this.#unheard) channel.fill(0);
+      this.#giveBack(emitter.process(this.#unheard));
+      channels.forEach((samples, k) => samples.forEach((_, i) => (samples[i] += (1 - (i + 1) / BLOCK) * this.#unheard[k][i])));
     }
     const sequence = this.#sequence++;
     return { ...poses, channels, sequence, sampleClock: sequence * BLOCK, frames: BLOCK, flags: 0, late };

@@ -18,6 +18,11 @@ export class ClipSource {
     this.#samples = samples;
   }
 
+  /** Whether there is something to play. */
+  get isReady() {
+    return this.#samples !== null;
+  }
+
   read(block) {
     block.fill(0);
     const samples = this.#samples;
@@ -33,6 +38,7 @@ export class ClipSource {
 }
 
 export class LiveSource {
+  isReady = true;
   #waiting = []; // arrays of samples
   #read = 0; // samples that are read of the first
   #count = 0;
