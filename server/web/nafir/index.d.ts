@@ -179,7 +179,8 @@ export interface ConnectOptions {
   head?: string;
   /** Of ambisonics, 1 to 3: turns of the head are then heard at once. */
   order?: 1 | 2 | 3;
-  /** s16 takes half the bytes of f32, which is used if left out. opus takes a tenth, at 48 kHz; where server or browser do not have it, it is s16. */
+  /** s16 takes half the bytes of f32, which is used if left out. opus takes a tenth, at 48 kHz; where server or browser do not have it, it is s16. Live
+      emitters are sent in it as well. */
   encoding?: "f32" | "s16" | "opus";
   opus?: OpusOptions;
   bufferBlocks?: number;

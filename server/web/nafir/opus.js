@@ -1,7 +1,10 @@
-// Blocks in Opus, decoded by WebCodecs. The browser decodes when it likes, so blocks come out a little later than they go in, in order.
+// Blocks in Opus, decoded by WebCodecs, and live sound on its way up, encoded by it. The browser does so when it likes, so what goes in
+// comes out a little later, in order.
 
 const RATE = 48_000; // at which browsers decode Opus, whatever it was made from
 const MICROSECONDS = 1e6;
+const MOST_WAITING_S = 0.5; // of live sound that is not encoded yet; what comes then is dropped
+const APPLICATIONS = { low_delay: "lowdelay", audio: "audio", voip: "voip" };
 
 /** Whether this browser decodes Opus to samples of this rate. */
 export async function decodesOpus(sampleRate) {
@@ -116,6 +119,61 @@ export class OpusReader {
   close() {
     this.#queue = [];
     for (const decoder of this.#decoders) decoder.close();
+  }
+}
+
+/** How a browser is to encode live sound as the server does a single channel: with half the bitrate of the stream's `options`. */
+function encoding(frames, { bitrate = 128_000, complexity = 5, application = "low_delay", signal = "auto" } = {}) {
+  const opus = { frameDuration: (MICROSECONDS * frames) / RATE, complexity, application: APPLICATIONS[application], signal };
+  return { codec: "opus", sampleRate: RATE, numberOfChannels: 1, bitrate: bitrate / 2, opus };
+}
+
+/** Whether this browser encodes live sound of this rate in packets of so many samples. */
+export async function encodesOpus(sampleRate, frames, options) {
+  if (sampleRate !== RATE || !globalThis.AudioEncoder) return false;
+  const answer = await AudioEncoder.isConfigSupported(encoding(frames, options)).catch(() => ({ supported: false }));
+  return answer.supported;
+}
+
+/** Encodes the sound of a live emitter. */
+export class OpusWriter {
+  #encoder;
+  #deliver;
+  #frames;
+  #written = 0; // samples
+  #given = 0; // those of packets that have come out
+
+  /** `frames` is the samples of a packet, `options` are those of the hello. `deliver` gets each packet; `fail` gets the error that ends the
+      writer. */
+  constructor({ frames, options, deliver, fail }) {
+    this.#frames = frames;
+    this.#deliver = deliver;
+    this.#encoder = new AudioEncoder({ output: (chunk) => this.#take(chunk), error: fail });
+    this.#encoder.configure(encoding(frames, options));
+  }
+
+  /** Takes the next samples, any number. They are dropped while too many wait. */
+  write(samples) {
+    if (this.#encoder.state !== "configured" || this.#written - this.#given > MOST_WAITING_S * RATE) return;
+    const timestamp = Math.round((MICROSECONDS * this.#written) / RATE);
+    const finite = samples.map((sample) => (Number.isFinite(sample) ? sample : 0));
+    const data = new AudioData({
+      format: "f32-planar", sampleRate: RATE, numberOfChannels: 1, numberOfFrames: samples.length, timestamp, data: finite,
+    });
+    this.#encoder.encode(data);
+    data.close();
+    this.#written += samples.length;
+  }
+
+  #take(chunk) {
+    this.#given += this.#frames;
+    const packet = new Uint8Array(chunk.byteLength);
+    chunk.copyTo(packet);
+    this.#deliver(packet);
+  }
+
+  close() {
+    if (this.#encoder.state !== "closed") this.#encoder.close();
   }
 }
 

@@ -3,9 +3,9 @@
 // milliseconds.
 
 import { authorized } from "./http.js";
-import { OpusReader } from "./opus.js";
+import { OpusReader, OpusWriter, encodesOpus } from "./opus.js";
 import {
-  FLAG_LATE, FLAG_RESTART, PROTOCOL, isBlock, message, parseBlock, parsePackets, serializeDryBlock, serializePose,
+  FLAG_LATE, FLAG_RESTART, PROTOCOL, isBlock, message, parseBlock, parsePackets, serializeDryBlock, serializeDryPacket, serializePose,
 } from "./wire.js";
 
 const POSE_INTERVAL_MS = 12; // at most about 80 poses a second; only the newest is sent
@@ -52,6 +52,8 @@ export class Stream {
   #encoding = "f32";
   #opus = null; // the reader of the first listener's blocks in Opus
   #newOpus = () => null; // of the listener with this id, or of the first if it is null
+  #packetFrames = null; // samples of a packet of live sound in Opus; null where it is sent as samples
+  #writers = new Map(); // id of a live emitter -> its OpusWriter
   #token = null; // resumes the stream
   #resumeMs = 0; // for so long after the connection was lost
   #lostAt = null; // when the connection of a stream to be resumed was lost
@@ -97,6 +99,7 @@ export class Stream {
     if (!known || known.clip !== clip) {
       if (known) this.#order(message.removeEmitter(id));
       this.#dry.delete(id);
+      this.#endWriter(id);
       this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
       this.#order(message.setGain(emitter));
@@ -126,17 +129,56 @@ export class Stream {
     this.#order(message.removeListener(id));
   }
 
-  /** Sends the next mono samples of a live emitter. They are dropped while it is not heard yet. */
+  /** Sends the next mono samples of a live emitter, in Opus where the stream is and the browser can, else as samples: in single precision
+      only where the stream has that. They are dropped while it is not heard yet. */
   feed(id, samples) {
+    if (!this.#dry.has(id) || !this.#welcomed) return;
+    if (this.#packetFrames !== null) this.#writerOf(id).write(samples);
+    else this.#sendDry(id, (sequence) => serializeDryBlock({ id, sequence, samples, encoding: this.#encoding === "f32" ? "f32" : "s16" }));
+  }
+
+  #sendDry(id, serialized) {
     const sequence = this.#dry.get(id);
     if (sequence === undefined || !this.#welcomed) return;
     this.#dry.set(id, sequence + 1);
-    this.#send(serializeDryBlock({ id, sequence, samples }));
+    this.#send(serialized(sequence));
+  }
+
+  #writerOf(id) {
+    let writer = this.#writers.get(id);
+    if (!writer) {
+      const frames = this.#packetFrames;
+      const deliver = (packet) => {
+        if (this.#writers.get(id) === writer) this.#sendDry(id, (sequence) => serializeDryPacket({ id, sequence, frames, packet }));
+      };
+      // A browser that fails at it sends samples.
+      writer = new OpusWriter({ frames, options: this.#hello.opus, deliver, fail: () => this.#endWriters() });
+      this.#writers.set(id, writer);
+    }
+    return writer;
+  }
+
+  #endWriters() {
+    this.#packetFrames = null;
+    for (const id of this.#writers.keys()) this.#endWriter(id);
+  }
+
+  #endWriter(id) {
+    this.#writers.get(id)?.close();
+    this.#writers.delete(id);
+  }
+
+  /** Encodes live sound from now on, if this browser can. */
+  async #encodeLive({ frame_samples: frames }, sampleRate) {
+    const reader = this.#opus;
+    const can = await encodesOpus(sampleRate, frames, this.#hello.opus);
+    if (can && this.#opus === reader) this.#packetFrames = frames;
   }
 
   removeEmitter(id) {
     if (!this.#emitters.delete(id)) return;
     this.#dry.delete(id);
+    this.#endWriter(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
     if (this.#isOpen) this.#order(message.removeEmitter(id));
@@ -247,6 +289,7 @@ export class Stream {
     this.#opus?.close();
     this.#opus = null;
     for (const other of this.#others.values()) other.opus?.close();
+    this.#endWriters();
     clearInterval(this.#watchdog);
     clearInterval(this.#heartbeat);
     const socket = this.#socket;
@@ -365,6 +408,7 @@ export class Stream {
     const fail = () => this.renew({ encoding: "s16", opus: undefined });
     this.#newOpus = (id) => (welcome.opus ? new OpusReader(welcome.opus, (block) => this.#listeners.block(block, id), fail) : null);
     this.#opus = this.#newOpus(null);
+    if (welcome.opus) this.#encodeLive(welcome.opus, welcome.sample_rate);
     this.#attempt = 0;
     this.#lastError = null;
     this.#dirty.clear();

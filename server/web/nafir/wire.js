@@ -31,19 +31,39 @@ export function serializePose({ poseId, position, number = 0, ...direction }) {
   return buffer;
 }
 
-/** The next mono samples (Float32Array) of a live emitter. `sequence` rises from block to block. */
-export function serializeDryBlock({ id, sequence, samples }) {
+const ENCODINGS = { f32: 0, s16: 1, opus: 2 }; // of dry blocks
+
+/** A dry block of so many bytes after its header and id: its view, and where they begin. */
+function dryBlock({ id, sequence, frames, encoding, bytes }) {
   const name = new TextEncoder().encode(id);
   const start = DRY_HEADER_BYTES + 4 * Math.ceil(name.length / 4);
-  const buffer = new ArrayBuffer(start + 4 * samples.length);
-  const view = new DataView(buffer);
+  const view = new DataView(new ArrayBuffer(start + bytes));
   view.setUint8(0, DRY_BLOCK);
+  view.setUint8(1, ENCODINGS[encoding]);
   view.setUint16(2, name.length, true);
   view.setUint32(4, sequence, true);
-  view.setUint32(8, samples.length, true);
-  new Uint8Array(buffer).set(name, DRY_HEADER_BYTES);
-  samples.forEach((sample, index) => view.setFloat32(start + 4 * index, sample, true));
-  return buffer;
+  view.setUint32(8, frames, true);
+  new Uint8Array(view.buffer).set(name, DRY_HEADER_BYTES);
+  return { view, start };
+}
+
+/** The next mono samples (Float32Array) of a live emitter, as f32 or s16. `sequence` rises from block to block. */
+export function serializeDryBlock({ id, sequence, samples, encoding = "f32" }) {
+  const width = encoding === "s16" ? 2 : 4;
+  const { view, start } = dryBlock({ id, sequence, frames: samples.length, encoding, bytes: width * samples.length });
+  samples.forEach((sample, index) => {
+    if (width === 4) view.setFloat32(start + 4 * index, sample, true);
+    else view.setInt16(start + 2 * index, Math.round(FULL_SCALE * Math.min(1, Math.max(-1, sample || 0))), true);
+  });
+  return view.buffer;
+}
+
+/** The next packet of Opus of a live emitter, which decodes to so many `frames`. `sequence` rises by one from block to block. */
+export function serializeDryPacket({ id, sequence, frames, packet }) {
+  const { view, start } = dryBlock({ id, sequence, frames, encoding: "opus", bytes: 2 + packet.length });
+  view.setUint16(start, packet.length, true);
+  new Uint8Array(view.buffer).set(packet, start + 2);
+  return view.buffer;
 }
 
 /** Whether a binary message is an audio block; a newer server may send other kinds. */
