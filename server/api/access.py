@@ -88,8 +88,8 @@ class Access:
         own_key: str | None = None,
         time_s: Callable[[], float] = time.time,
     ) -> None:
-        """`own_key` is the one by which the processes of a server ask each other for metrics. Raises NafirError for
-        files that cannot be used."""
+        """`own_key` is the one by which the processes of a server ask each other for metrics and streams. Raises
+        NafirError for files that cannot be used."""
         self._read_keys = read_keys
         self._read_tokens = read_tokens
         self._files = files
@@ -146,7 +146,7 @@ class Access:
 
     def _admit_key(self, key: str) -> Caller:
         if self._own is not None and hmac.compare_digest(digest(key), self._own):
-            return Caller("own process", frozenset({"metrics"}), None, None)
+            return Caller("own process", frozenset({"metrics", "admin"}), None, None)
         entry = self._keys.find(key)
         if entry is None:
             raise AccessError("key_refused", "there is no such key: it may have been revoked")

@@ -41,7 +41,7 @@ from server.api.catalogue import describe_scene
 from server.api.inflow import LISTENER_COST, Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
-from server.api.process_peers import ProcessPeers
+from server.api.process_peers import MovedStream, ProcessPeers
 from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
 from server.api.settings import Settings, usable_cores
@@ -348,6 +348,24 @@ class StreamHost:
         error = refusal.error
         return problem(503, error.code, str(error), retry_after_s=error.retry_after_s)
 
+    async def take_kept(self, token: str, *, owner: str | None) -> KeptStream | None:
+        """The stream of a token, from this process or from another that serves at the same port; None if none has
+        it."""
+        kept = await self.kept.take(token, owner=owner)
+        if kept is not None or self.peers is None:
+            return kept
+        moved = await asyncio.to_thread(self.peers.take, token, owner)
+        return None if moved is None else KeptStream.moved(moved, token, owner)
+
+    async def give_kept(self, token: str, *, owner: str | None) -> MovedStream | None:
+        """The stream of a token for another process; it has no place here any more."""
+        kept = await self.kept.take(token, owner=owner)
+        if kept is None:
+            return None
+        if kept.place is not None:
+            self.admission.leave(kept.place)
+        return MovedStream(kept.data, kept.plays_s, kept.until_s)
+
     def take(self, scene: "MeasuredScene") -> None:
         """Offer a scene from now on, in place of any other with its id. Streams that are open keep theirs."""
         levels = scene.levels
@@ -594,7 +612,7 @@ class Connection:
         unsupported_protocol."""
         require_protocol(asked)
         host = self._host
-        kept = None if asked.token is None else await host.kept.take(asked.token, owner=self._owner)
+        kept = None if asked.token is None else await host.take_kept(asked.token, owner=self._owner)
         if kept is not None:
             host.kept.outcomes["resumed"] += 1
         elif asked.snapshot is not None and host.seal is not None:

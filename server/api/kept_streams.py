@@ -16,7 +16,9 @@ import secrets
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Self
 
+from server.api.process_peers import MovedStream
 from server.protocol.snapshot import MOST_BYTES
 from server.streaming.admission import Place
 
@@ -30,8 +32,8 @@ _PATIENCE_S = 2.0
 @dataclass(eq=False)
 class KeptStream:
     """A stream to go on with: its snapshot as JSON, and when the snapshot's next block would play, in seconds of the
-    clock of the audio engine. `place` is held for it, if there was one to hold. One that a client has kept itself has
-    no `tokens`."""
+    monotonic clock, which all processes of a machine share. `place` is held for it, if there was one to hold. One that
+    a client has kept itself has no `tokens`."""
 
     data: bytes
     plays_s: float
@@ -40,6 +42,13 @@ class KeptStream:
     owner: str | None = field(default=None, init=False)
     until_s: float = field(default=0.0, init=False)
     expiry: asyncio.TimerHandle | None = field(default=None, init=False)
+
+    @classmethod
+    def moved(cls, stream: MovedStream, token: str, owner: str | None) -> Self:
+        """One that another process has kept under a token."""
+        kept = cls(stream.data, stream.plays_s)
+        kept.tokens, kept.owner, kept.until_s = (token,), owner, stream.until_s
+        return kept
 
 
 @dataclass(eq=False)

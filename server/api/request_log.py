@@ -23,8 +23,8 @@ from server.runtime.traces import span
 
 REQUEST_ID: Final = "X-Request-ID"
 _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
-_QUIET: Final = frozenset({"/livez", "/readyz", "/metrics", "/metrics/process"})
-"""Paths that are asked for every few seconds: only what goes wrong with them is written."""
+_QUIET: Final = frozenset({"/livez", "/readyz", "/metrics", "/metrics/process", "/streams/process"})
+"""Paths that are asked for every few seconds, or by another process: only what goes wrong with them is written."""
 _CLIENT_CLOSED_REQUEST = 499
 _REFUSED: Final = ("401", "403", "429")
 """Statuses of refusals that are counted: those that depend on who asks, and not on what is asked."""

@@ -11,7 +11,8 @@ import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, WebSocket
 from fastapi.responses import JSONResponse, StreamingResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from pydantic import BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
@@ -22,7 +23,7 @@ from server.api.bundle_files import BundleFiles
 from server.api.catalogue import describe_encodings, describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
-from server.api.process_peers import OWN_METRICS
+from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY
 from server.api.ranged_files import RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
@@ -163,6 +164,23 @@ async def own_metrics(request: Request) -> Response:
     """Metrics of the process that answers; the other processes ask for them."""
     body = await anyio.to_thread.run_sync(exposition, ServerCollector(_host(request)))
     return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+@health.post(OWN_STREAMS, include_in_schema=False)
+async def own_stream(request: Request) -> Response:
+    """A stream that this process has kept, for another process of the same server; 204 if it has none of this token.
+    Anybody else is told that there is nothing here."""
+    host = _host(request)
+    if host.peers is None or not host.peers.is_peer(request.headers.get(PEER_KEY)):
+        raise HTTPException(404, "Not Found")
+    asked = _AskedStream.model_validate_json(await request.body())
+    moved = await host.give_kept(asked.token, owner=asked.owner)
+    return Response(status_code=204) if moved is None else Response(moved.serialize(), media_type="application/json")
+
+
+class _AskedStream(BaseModel):
+    token: str
+    owner: str | None
 
 
 @documents.get("/asyncapi.json")

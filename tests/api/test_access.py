@@ -17,7 +17,7 @@ from server.api.access_gate import KEY_PROTOCOL, scopes_for
 from server.api.api_keys import SCOPES, create_key, revoke_key
 from server.api.app import WEB, create_app
 from server.api.connection import SUBPROTOCOL
-from server.api.process_peers import OWN_METRICS, ProcessPeers
+from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, ProcessPeers
 from server.api.settings import Settings, settings_of
 from server.core.errors import NafirError
 from server.field.fields_by_level import FieldsByLevel
@@ -161,6 +161,7 @@ def test_a_key_in_the_query_opens_nothing(client, keys):
         ("GET", "/metrics", {"metrics", "admin"}),
         ("GET", OWN_METRICS, {"metrics", "admin"}),
         ("POST", "/metrics", {"admin"}),
+        ("POST", OWN_STREAMS, {"admin"}),
         ("GET", "/anything/new", {"admin"}),
         ("POST", "/v1/scenes", {"admin"}),
         ("DELETE", "/v1/scenes/flat", {"admin"}),
@@ -370,9 +371,14 @@ def test_the_document_says_what_needs_a_key(client, keys):
     assert "401" in response["responses"]
 
 
-def test_the_processes_of_a_server_ask_each_other_with_a_key_of_their_own(client):
+def test_the_processes_of_a_server_ask_each_other_with_a_key_of_their_own(client, keys):
     assert client.get(OWN_METRICS, headers=bearer(PEERS_KEY)).status_code == 200
     check_refused(client.get("/v1/scenes", headers=bearer(PEERS_KEY)), 403, "scope_missing")
+    asked = {"token": "of-nobody", "owner": None}
+    of_peer = bearer(PEERS_KEY) | {PEER_KEY: PEERS_KEY}
+    assert client.post(OWN_STREAMS, headers=of_peer, json=asked).status_code == 204
+    for other in (bearer(keys["admin"]), bearer(keys["admin"]) | {PEER_KEY: keys["admin"]}):
+        assert client.post(OWN_STREAMS, headers=other, json=asked).status_code == 404
     assert PEERS_KEY not in repr(ProcessPeers(0, (1,), PEERS_KEY))
 
 

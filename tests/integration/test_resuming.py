@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
@@ -22,6 +23,8 @@ from websockets.sync.client import connect
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.geometry import Pose
 from server.api.app import create_app
+from server.api.process_peers import OWN_STREAMS, PEER_KEY, ProcessPeers
+from server.api.processes import listening_privately
 from server.api.serving import Server, uvicorn_options
 from server.api.settings import Settings
 from server.assets.clips import ClipLibrary
@@ -58,6 +61,7 @@ HELLO = Hello(
 )
 IN_OPUS = HELLO.model_copy(update={"encoding": "opus", "opus": OpusOptions(bitrate=256_000)})
 TALKER = AddEmitter(id="talker", clip=CLIP, position=PLACE)
+KEY = "a key of the processes"
 SETTLED = 8_000
 """Samples after which the response is filled with sound, and all fades are over."""
 
@@ -373,6 +377,84 @@ def wait_until_ready(address, patience_s=60.0):
             return
         time.sleep(0.05)
     raise AssertionError("the server never became ready")
+
+
+@contextmanager
+def two_processes(bundle, hrtfs):
+    """HOST:PORT of each of two servers that are processes of one."""
+    own = [listening_privately() for _ in range(2)]
+    ports = tuple(each.getsockname()[1] for each in own)
+    servers, threads = [], []
+    for number, listener in enumerate(own):
+        settings = Settings(port=0)
+        peers = ProcessPeers(number, ports, KEY)
+        app = create_app(settings, scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs, peers=peers)
+        servers.append(uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings))))
+        threads.append(threading.Thread(target=servers[-1].run, args=([listener],)))
+        threads[-1].start()
+    addresses = [f"127.0.0.1:{port}" for port in ports]
+    try:
+        for address in addresses:
+            wait_until_ready(address)
+        yield addresses
+    finally:
+        for server, thread in zip(servers, threads, strict=True):
+            server.should_exit = True
+            thread.join()
+
+
+def asked_for(address, token, key=None):
+    """The status with which a process answers whoever asks it for a stream."""
+    body = json.dumps({"token": token, "owner": None}).encode()
+    headers = {"Content-Type": "application/json", **({} if key is None else {PEER_KEY: key})}
+    request = urllib.request.Request(f"http://{address}{OWN_STREAMS}", body, headers)
+    try:
+        with urllib.request.urlopen(request, timeout=5) as answer:
+            return answer.status
+    except urllib.error.HTTPError as answer:
+        return answer.code
+
+
+@pytest.mark.parametrize("is_broken", [True, False], ids=["lost", "half open"])
+def test_a_token_of_one_process_resumes_at_another(bundle, hrtfs, expected, is_broken):
+    with two_processes(bundle, hrtfs) as (one, other), listening(one) as before:
+        since = begin(before)
+        before.hear(RATE // 4)
+        if is_broken:
+            before.drop()
+        # Nobody else gets it, whatever they know.
+        assert {asked_for(one, before.first.resume_token, key) for key in (None, "", "another key")} == {404}
+        with listening(other, before.resumption()) as again:
+            resumed = again.first.resumed
+            assert again.first.session == before.first.session
+            assert resumed.sequence > before.blocks[-1].sequence
+            again.hear(SETTLED + RATE // 4)
+            if not is_broken:
+                assert before.to_the_end().reason == "taken_over"
+            # It is at the other process now, and at that alone; and goes back as it came.
+            assert streams_of(one) == 0
+            assert streams_of(other) == 1
+            again.drop()
+        with listening(one, again.resumption()) as back:
+            back.hear(SETTLED + RATE // 4)
+        for blocks in (again.blocks, back.blocks):
+            assert error_db(after(blocks, SETTLED), expected, since) < -80
+
+
+def test_a_token_that_no_process_knows_is_told_at_once(bundle, hrtfs):
+    with two_processes(bundle, hrtfs) as (one, other):
+        began_s = time.monotonic()
+        with listening(one, Resume(protocol=PROTOCOL, token="of-nobody")) as stranger:
+            assert stranger.first.code == "unknown_resume_token"
+            assert stranger.to_the_end().code == 1008
+        assert time.monotonic() - began_s < 2
+        assert asked_for(other, "of-nobody", KEY) == 204
+
+
+def streams_of(address):
+    with urllib.request.urlopen(f"http://{address}/metrics/process", timeout=5) as answer:
+        lines = answer.read().decode().splitlines()
+    return sum(float(line.split()[-1]) for line in lines if line.startswith("nafir_streams{"))
 
 
 def test_a_server_that_shuts_down_hands_its_streams_to_another(bundle, hrtfs, expected):
