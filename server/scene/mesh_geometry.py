@@ -7,6 +7,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.mesh import MeshError, TriangleMesh
 from server.scene.geometry import Geometry, Material, PlanPoint
 
@@ -47,6 +48,13 @@ class MeshGeometry:
         surfaces = np.repeat([0, 1, 2], [len(walls), len(floor), len(floor)])
         mesh = TriangleMesh(np.concatenate([low, high]), triangles, surfaces, _SURFACES)
         return cls(mesh, {name: getattr(geometry.materials, name) for name in _SURFACES})
+
+    def without_scattering(self) -> "MeshGeometry":
+        """The same place with specular reflections only."""
+        smooth = {"scattering": (0.0,) * len(OCTAVE_BANDS_HZ)}
+        return MeshGeometry(
+            self.mesh, {name: material.model_copy(update=smooth) for name, material in self.materials.items()}
+        )
 
     def of_surfaces(self, name: str) -> npt.NDArray[np.float64]:
         """(material, band) `absorption` or `scattering`, in the order of the mesh's materials."""

@@ -45,6 +45,8 @@ def simulate(
 ) -> None:
     """Simulate what a scene calls for, between all pairs of probes. Run again after an interruption to go on."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from training.data.levels.level_scene import read_scene
+    from training.data.scene_file import SceneFile
     from training.parallel.jobs import open_jobs
     from training.simulation.run import simulate as simulate_scene
 
@@ -52,12 +54,14 @@ def simulate(
     console = simulation.wide_console(stderr=True)
     with console.status("planning, and tracing the late sound that pairs may share"):
         ready = simulation.simulation_of(scene, seed, effects)
-    simulation.print_plan(console, ready.scene, ready.plan)
+        read = read_scene(scene)
+    simulation.print_plan(console, read, ready.plan, seed)
     with open_jobs(cluster, threads=workers or os.cpu_count() or 1) as jobs, _progress() as progress:
         dataset = simulate_scene(scene, output, seed=seed, jobs=jobs, progress=progress, simulation=ready)
     from training.simulation.responses import SimulatedResponses
 
-    _print_findings(SimulatedResponses(dataset))
+    if isinstance(read, SceneFile):
+        _print_findings(SimulatedResponses(dataset))
     trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
     typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")
 

@@ -14,6 +14,7 @@ from server.core.errors import NafirError
 from training.cli.options import Seed
 
 if TYPE_CHECKING:
+    from training.data.levels.level_scene import LevelScene
     from training.data.scene_file import SceneFile
     from training.data.simulation_plan import SimulationPlan
     from training.simulation.check import PlanCheck
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 _CHECK_WIDTH = 100
 _TAIL_RAYS_TRIED = 2_000
 
-Scene = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
+Scene = Annotated[Path, typer.Argument(help="Scene file (TOML), or the folder of an imported level.")]
 Effects = Annotated[
     str,
     typer.Option(
@@ -41,23 +42,33 @@ def wide_console(*, stderr: bool = False) -> Console:
 
 def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
     """A prepared simulation, with a plan that predicts its cost on this host."""
-    from training.simulation.cost import is_brief, with_costs
+    from training.data.levels.level_scene import LevelScene
+    from training.simulation.cost import is_brief, predicted_s, with_costs
     from training.simulation.run import prepared
+    from training.simulation.size import level_extent
 
     read, decided = _plan_by_size(scene, seed, effects)
     simulation = prepared(read, seed=seed, plan=decided)
+    if isinstance(read, LevelScene):
+        level_extent(read, len(simulation.probes))  # before anything is traced
+        return replace(simulation, plan=replace(decided, cost_s=predicted_s(simulation)))
     return replace(simulation, plan=with_costs(simulation)) if is_brief(read) else simulation
 
 
-def _plan_by_size(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, SimulationPlan]":
-    """The scene and its plan, with a cost that follows from the scene file's numbers alone."""
-    from training.data.scene_file import SceneFile
+def _plan_by_size(scene: Path, seed: int, effects: str) -> "tuple[SceneFile | LevelScene, SimulationPlan]":
+    """The scene and its plan, with a cost that follows from a scene file's numbers alone; that of a level is not
+    known."""
+    from training.data.levels.level_scene import LevelScene, read_scene
     from training.data.simulation_plan import overrides_among
-    from training.simulation.planner import planner_of
+    from training.simulation.planner import plan_of_level, planner_of
     from training.simulation.size import SimulationSize
 
     named = _parse_effects(effects)
-    read = SceneFile.read(scene)
+    read = read_scene(scene)
+    if isinstance(read, LevelScene):
+        if named:
+            raise NafirError("--effects: a level is simulated with everything on: leave the option out")
+        return read, plan_of_level(read)
     planner = planner_of(read, seed)
     decided = planner.everything if effects == "all" else planner.plan(overrides_among({**read.effects, **named}))
     return read, replace(decided, cost_s=60 * SimulationSize(read).core_minutes)
@@ -66,7 +77,7 @@ def _plan_by_size(scene: Path, seed: int, effects: str) -> "tuple[SceneFile, Sim
 def _parse_effects(effects: str) -> dict[str, bool]:
     from training.data.simulation_plan import SimulatedEffect
 
-    if effects == "plan":
+    if effects in {"plan", "all"}:
         return {}
     named = {}
     for part in effects.split(","):
@@ -92,11 +103,15 @@ def plan(
 ) -> None:
     """Show what simulating a scene calls for, why, and how long it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from training.data.levels.level_scene import LevelScene
     from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
 
     read, planned = _plan_by_size(scene, seed, effects)
-    if is_brief(read):
+    if isinstance(read, LevelScene):
+        if check is not None:
+            raise NafirError("--check: a level is simulated with everything on: there is nothing to compare with")
+    elif is_brief(read):
         planned = with_costs(prepared(read, seed=seed, plan=planned, most_tail_rays=_TAIL_RAYS_TRIED))
     checked = None if check is None else _check(scene, planned, check, seed)
     if as_json:
@@ -104,7 +119,7 @@ def plan(
         typer.echo(json.dumps(content, indent=2))
         return
     console = wide_console()
-    print_plan(console, read, planned)
+    print_plan(console, read, planned, seed)
     if checked is not None:
         console.print(_check_table(checked))
 
@@ -142,12 +157,19 @@ def _check_table(checked: "PlanCheck") -> Table:
     return table
 
 
-def print_plan(console: Console, scene: "SceneFile", plan: "SimulationPlan") -> None:
+def print_plan(console: Console, scene: "SceneFile | LevelScene", plan: "SimulationPlan", seed: int) -> None:
     """Prints the plan as a table, the size of the simulation, and notes on the scene file."""
-    from training.simulation.size import SimulationSize
+    from training.data.levels.level_scene import LevelScene
+    from training.simulation.size import SimulationSize, level_extent
 
-    console.print(plan_table(plan))
-    console.print(f"{SimulationSize(scene).extent} at most", highlight=False)
+    if isinstance(scene, LevelScene):
+        console.print(_summary(plan), highlight=False)
+        if plan.cost_s is not None:
+            console.print(f"about {plan.cost_s:,.0f} s of one core, by short runs here", highlight=False)
+        console.print(level_extent(scene, len(scene.probe_positions(seed))), highlight=False)
+    else:
+        console.print(plan_table(plan))
+        console.print(f"{SimulationSize(scene).extent} at most", highlight=False)
     for note in plan.notes:
         console.print(f"note: {note}", highlight=False)
 

@@ -28,8 +28,10 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from training.data.dataset_check import DatasetError, require_possible_energies
+from training.data.levels.level_scene import SCENE_FILE, LevelScene, is_same_scene, read_scene
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.data.shared_tail import FADE_S, SharedTail
+from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
 
 SPEED_OF_SOUND = 343.0
@@ -44,7 +46,7 @@ _HOLDS = {2: "the first reflections too", 3: "responses of one head", 4: "respon
 """What files of earlier formats hold that is not read any more."""
 
 
-def own_duration_s(scene: SceneFile, plan: SimulationPlan) -> float:
+def own_duration_s(scene: SimulatedScene, plan: SimulationPlan) -> float:
     """The length of the energies that each pair stores: the whole response, or, where pairs share a tail, the part
     until the tail has set in, in whole histogram bins."""
     if plan.tail_start_s is None:
@@ -58,7 +60,7 @@ class Dataset:
     """A dataset folder that is open for reading. `create` makes a new one, which the simulation fills."""
 
     folder: Path
-    scene: SceneFile
+    place: SceneFile | LevelScene
     seed: int
     probes: npt.NDArray[np.float64]
     yaws: npt.NDArray[np.float64]
@@ -72,10 +74,10 @@ class Dataset:
 
         Raises DatasetError if the folder holds another scene, seed or plan.
         """
-        scene = SceneFile.read(scene_path)
+        scene = read_scene(scene_path)
         if (folder / "pairs.h5").exists():
             existing = cls.open(folder, finished=False)
-            if existing.scene != scene or existing.seed != seed:
+            if not is_same_scene(existing.place, scene) or existing.seed != seed:
                 raise DatasetError(f"{folder}: holds another scene or seed; choose an empty folder")
             if existing.remaining() and existing.effects.settings != effects.settings:
                 raise DatasetError(f"{folder}: was begun with another plan of effects; choose an empty folder")
@@ -84,7 +86,10 @@ class Dataset:
         yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
         held_out = _choose_held_out(len(probes), scene.simulation.held_out_share, np.random.default_rng([seed, 1]))
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "scene.toml").write_bytes(scene_path.read_bytes())
+        scene_path = scene_path / SCENE_FILE if scene_path.is_dir() else scene_path
+        (folder / SCENE_FILE).write_bytes(scene_path.read_bytes())
+        if isinstance(scene, LevelScene):
+            scene.copy_meshes(scene_path.parent, folder)
         # The file gets its final name when it is whole: an interrupted start must not look like a damaged dataset.
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
@@ -110,7 +115,7 @@ class Dataset:
         if (folder / "responses.h5").is_file():
             raise DatasetError(f"{folder}: holds measured responses; this takes a simulated scene")
         try:
-            scene = SceneFile.read(folder / "scene.toml")
+            scene = read_scene(folder / SCENE_FILE)
             with h5py.File(folder / "pairs.h5", "r") as file:
                 found = file.attrs.get("format")
                 if found != FORMAT:
@@ -140,7 +145,7 @@ class Dataset:
         path = self.folder / "pairs.h5"
         for name, values, shape in (
             ("probes", self.probes, (len(self.probes), 3)),
-            ("yaws", self.yaws, (self.scene.simulation.yaws,)),
+            ("yaws", self.yaws, (self.place.simulation.yaws,)),
             ("held_out", self.held_out, (len(self.probes), len(self.probes))),
         ):
             if values.shape != shape or not np.isfinite(values).all():
@@ -148,17 +153,24 @@ class Dataset:
         pairs = len(TAKES), len(self.probes), len(self.probes)
         try:
             with h5py.File(path, "r") as file:
-                require_possible_energies(path, file, (*pairs, *_histogram(self.scene, self.effects)))
+                require_possible_energies(path, file, (*pairs, *_histogram(self.place, self.effects)))
         except (OSError, KeyError, TypeError, ValueError) as exc:
             raise DatasetError(f"{path}: cannot be read: {exc}") from exc
 
     @property
+    def scene(self) -> SceneFile:
+        """The scene file of a floor plan. Raises DatasetError for a level."""
+        if not isinstance(self.place, SceneFile):
+            raise DatasetError(f"{self.folder}: holds a level, and this takes a floor plan so far")
+        return self.place
+
+    @property
     def sample_rate(self) -> int:
-        return self.scene.simulation.sample_rate
+        return self.place.simulation.sample_rate
 
     @property
     def samples(self) -> int:
-        return round(self.scene.simulation.duration_s * self.sample_rate)
+        return round(self.place.simulation.duration_s * self.sample_rate)
 
     @cached_property
     def plan(self) -> FloorPlan:
@@ -167,7 +179,7 @@ class Dataset:
     @cached_property
     def onset_s(self) -> npt.NDArray[np.float64]:
         """(emitter, listener) seconds until the first sound can arrive, along the shortest path around corners."""
-        return self.plan.path_length_m(self.probes[:, None], self.probes[None]) / SPEED_OF_SOUND
+        return self.place.path_length_m(self.probes[:, None], self.probes[None]) / SPEED_OF_SOUND
 
     def remaining(self) -> list[int]:
         """Numbers of the emitters that are not simulated yet."""
@@ -236,7 +248,7 @@ class Dataset:
         return np.stack([tail.join(*of_pair) for of_pair in zip(numbers, energies, strict=True)])
 
 
-def _histogram(scene: SceneFile, plan: SimulationPlan) -> tuple[int, int, int]:
+def _histogram(scene: SceneFile | LevelScene, plan: SimulationPlan) -> tuple[int, int, int]:
     """The shape (direction, band, bin) of the energies that each pair stores."""
     bins = round(own_duration_s(scene, plan) / HISTOGRAM_BIN_S)
     return scene.simulation.arrival_directions, len(OCTAVE_BANDS_HZ), bins

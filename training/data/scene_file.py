@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from server.acoustics.geometry import Points
 from server.core.errors import NafirError
 from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
@@ -21,7 +22,7 @@ HISTOGRAM_BIN_S = 0.004
 
 _DRAWS_PER_CELL = 32
 # At least one couple of probes is held out, and two probes make only one couple.
-_FEWEST_PROBES = 3
+FEWEST_PROBES = 3
 
 _CELLS_PER_BATCH = 256
 LONGEST_SIDE_M, SHORTEST_SIDE_M = 1_000.0, 0.5
@@ -113,9 +114,7 @@ class SceneFile(Strict):
         try:
             content = tomllib.loads(path.read_text(encoding="utf-8"))
             if isinstance(content.get("geometry"), dict) and "mesh" in content["geometry"]:
-                raise SceneFileError(
-                    f"{path}: geometry.mesh: is an imported level, and only floor plans are simulated so far"
-                )
+                raise SceneFileError(f"{path}: geometry.mesh: is an imported level, and this takes a floor plan")
             return cls.model_validate(content)
         except OSError as exc:
             raise SceneFileError(f"{path}: cannot be read: {exc.strerror}") from exc
@@ -176,6 +175,10 @@ class SceneFile(Strict):
             raise ValueError(f"geometry.{faults[0]}")
         return self
 
+    def path_length_m(self, a: Points, b: Points) -> npt.NDArray[np.float64]:
+        """(...,) lengths of the shortest paths of sound between points; straight ones where there is none."""
+        return self.geometry.floor_plan.path_length_m(a, b)
+
     @property
     def plan_extent_m(self) -> tuple[float, float]:
         """Size of the floor plan along x and y."""
@@ -211,9 +214,9 @@ class SceneFile(Strict):
         first = np.argmax(clear, axis=1)
         openings = np.asarray([opening.centre for opening in self.geometry.openings]).reshape(-1, 2)
         spots = np.concatenate([draws[np.arange(len(draws)), first][clear.any(axis=1)], openings])
-        if len(spots) < _FEWEST_PROBES:
+        if len(spots) < FEWEST_PROBES:
             raise SceneFileError(
-                f"{self.id}: probes.spacing_m: fewer than {_FEWEST_PROBES} probes fit into the room, "
+                f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit into the room, "
                 f"{grid.spacing_m:g} m apart and {grid.wall_clearance_m:g} m from its walls (probes.wall_clearance_m)"
             )
         shuffled = rng.permutation(len(spots)) + 0.5

@@ -35,9 +35,9 @@ class ExpectedSpectrograms:
             raise ValueError(f"the codec has {codec.sample_rate} Hz, the dataset {dataset.sample_rate} Hz")
         self._dataset = dataset
         self._codec = codec
-        directions = sphere_directions(dataset.scene.simulation.arrival_directions)
+        directions = sphere_directions(dataset.place.simulation.arrival_directions)
         self._synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
-        self._mirrored = MirroredReflections(dataset.scene, dataset.effects, dataset.probes)
+        self._mirrored = MirroredReflections(dataset.place, dataset.effects, dataset.probes)
 
     @cached_property
     def _arrival_products(self) -> _Singles:

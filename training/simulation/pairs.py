@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from server.rendering.hrtf import kemar
 from training.data.dataset import own_duration_s
-from training.data.scene_file import SceneFile
 from training.data.shared_tail import TRAINING, SharedTail
+from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.late_sound import LateSound, MirroredReflections
 from training.simulation.rays import sphere_directions
@@ -36,7 +36,7 @@ class PairSimulation:
     or None if each has its own. `prepare` makes a simulation, in `prepared_s` seconds of one core. Several threads may
     use one."""
 
-    scene: SceneFile
+    scene: SimulatedScene
     probes: _Floats
     yaws: _Floats
     seed: int
@@ -47,7 +47,7 @@ class PairSimulation:
     @classmethod
     def prepare(
         cls,
-        scene: SceneFile,
+        scene: SimulatedScene,
         probes: _Floats,
         yaws: _Floats,
         *,
@@ -103,7 +103,7 @@ class PairSimulation:
 
 
 def _tail_energy(
-    scene: SceneFile, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator
+    scene: SimulatedScene, probes: _Floats, plan: SimulationPlan, rng: np.random.Generator
 ) -> tuple[_Floats, float]:
     """The mean energy (direction, band, bin) between pairs of probes all over the room, and the time of its computation
     in seconds of one core."""

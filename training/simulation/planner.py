@@ -4,8 +4,11 @@ An effect is called for if leaving it out would change some parameter by a quart
 more: errors of the data add to the errors of the fields trained on them, which are two to three times as large.
 """
 
+from dataclasses import replace
+
 from server.planning.decision import Threshold
 from training.data.dataset import GEOMETRIC_ORDER
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
 from training.simulation.predictions import Prediction, Predictions
@@ -19,6 +22,14 @@ def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
     be simulated, or too large for its responses."""
     SimulationSize(scene).require_reasonable()
     return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
+
+
+def plan_of_level(scene: LevelScene) -> SimulationPlan:
+    """Return the plan for a level, which leaves nothing out: what its effects change is not predicted."""
+    masses = [material.surface_mass_kg_m2 for material in scene.place.materials.values()]
+    plan = SimulationPlan.everything(GEOMETRIC_ORDER, scene.simulation.rays, transmission=any(masses))
+    note = "levels are simulated with everything on; what more than one surface mirrors is traced by rays"
+    return replace(plan, notes=(note,))
 
 
 class SimulationPlanner:

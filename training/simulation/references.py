@@ -35,20 +35,20 @@ class GeometricSound:
     @cached_property
     def synthesis(self) -> BinauralSynthesis:
         dataset = self.dataset
-        directions = sphere_directions(dataset.scene.simulation.arrival_directions)
+        directions = sphere_directions(dataset.place.simulation.arrival_directions)
         filters = self.filters or kemar(dataset.sample_rate)
         heads = dataset.yaws if self.heads is None else self.heads
         return BinauralSynthesis(filters, directions, heads, dataset.samples)
 
     @cached_property
     def _direct_paths(self) -> DirectPaths:
-        return DirectPaths.of(self.dataset.scene, self.dataset.effects)
+        return DirectPaths.of(self.dataset.place, self.dataset.effects)
 
     @cached_property
     def _images(self) -> list[list[tuple[_Floats, _Floats]]]:
         """The positions and amplitudes of the first reflections, by emitter and listener."""
         dataset = self.dataset
-        tracer = RoomTracer.of(dataset.scene, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
+        tracer = RoomTracer.of(dataset.place, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
         return [tracer.images(emitter) for emitter in dataset.probes]
 
     def direct(self, emitter: int, listener: int) -> _Responses:
@@ -82,7 +82,7 @@ class References:
         self._dataset = dataset
         self.take = take
         self._geometric = GeometricSound(dataset, filters, heads)
-        mirrored = MirroredReflections(dataset.scene, dataset.effects, dataset.probes)
+        mirrored = MirroredReflections(dataset.place, dataset.effects, dataset.probes)
         self._late = LateSound(mirrored, dataset.seed, self._geometric.synthesis)
 
     def reflected(self, emitter: int, listener: int) -> _Responses:

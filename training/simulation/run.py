@@ -15,17 +15,20 @@ import numpy.typing as npt
 from rich.progress import Progress
 
 from training.data.dataset import Dataset
-from training.data.scene_file import SceneFile
+from training.data.levels.level_scene import LevelScene, read_scene
+from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan, overrides_among
 from training.parallel.jobs import IsOver, Job, Jobs
 from training.simulation.half_precision import to_half
 from training.simulation.pairs import PairSimulation
-from training.simulation.planner import planner_of
+from training.simulation.planner import plan_of_level, planner_of
 
 _Takes = list[dict[int, npt.NDArray[np.float16]]]
 
 
-def prepared(scene: SceneFile, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None) -> PairSimulation:
+def prepared(
+    scene: SimulatedScene, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None
+) -> PairSimulation:
     """Prepare the simulation of all pairs of probes in a dataset of this seed; `most_tail_rays` as in
     `PairSimulation.prepare`."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
@@ -45,10 +48,16 @@ def simulate(
     """Fill the dataset folder, or resume an earlier run. Without a prepared `simulation`, all effects that the scene
     calls for are simulated.
 
-    Raises SceneFileError for a bad scene file, and DatasetError for a folder that contains another scene.
+    The scene is a scene file or the folder of a level. Raises SceneFileError for a bad one, and DatasetError for a
+    folder that contains another scene.
     """
-    scene = SceneFile.read(scene_path)
-    plan = planner_of(scene, seed).plan(overrides_among(scene.effects)) if simulation is None else simulation.plan
+    scene = read_scene(scene_path)
+    if simulation is not None:
+        plan = simulation.plan
+    elif isinstance(scene, LevelScene):
+        plan = plan_of_level(scene)
+    else:
+        plan = planner_of(scene, seed).plan(overrides_among(scene.effects))
     dataset = Dataset.create(folder, scene_path, seed, plan)
     remaining = dataset.remaining()
     task = progress.add_task("simulating", total=len(dataset.probes), completed=len(dataset.probes) - len(remaining))
@@ -75,7 +84,7 @@ class _Emitter:
 def _emitters(dataset: Dataset, remaining: Iterable[int]) -> Iterable[Job[_Emitter]]:
     for number in remaining:
         emitter = _Emitter(number, np.flatnonzero(dataset.held_out[number]))
-        yield Job(f"scene {dataset.scene.id}, emitter {number}", emitter)
+        yield Job(f"scene {dataset.place.id}, emitter {number}", emitter)
 
 
 def _simulate(simulation: PairSimulation, emitter: _Emitter, is_over: IsOver) -> _Takes:

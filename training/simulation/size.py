@@ -7,7 +7,8 @@ from functools import cached_property
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.data.dataset import SPEED_OF_SOUND
-from training.data.scene_file import SceneFile, SceneFileError
+from training.data.levels.level_scene import LevelScene
+from training.data.scene_file import SceneFile, SceneFileError, Simulation
 
 MOST_PROBES = 2_000
 """The most probes. Each is heard from every other: four million pairs."""
@@ -25,6 +26,7 @@ _HIT_S, _WALL_S, _RECEIVER_S = 60e-9, 3e-9, 5e-9
 # Larger values are probably in another unit.
 _LARGE_M = 100.0
 _LONG_S = 20.0
+_DATA = "probes.spacing_m, simulation.arrival_directions or duration_s"
 
 
 @dataclass(frozen=True)
@@ -45,19 +47,13 @@ class SimulationSize:
         return self.probes * (self.probes - 1)
 
     @property
-    def _histogram(self) -> int:
-        """The number of energies of one pair."""
-        settings = self.scene.simulation
-        return settings.arrival_directions * len(OCTAVE_BANDS_HZ) * settings.histogram_bins
-
-    @property
     def dataset_gb(self) -> float:
-        return 2 * self.pairs * self._histogram * (1 + self.scene.simulation.held_out_share) / 1e9
+        return _dataset_gb(self.scene.simulation, self.probes)
 
     @property
     def memory_gb(self) -> float:
-        """Memory for one emitter: energies three times in single precision and once in half precision."""
-        return (14 * self.probes * self._histogram + 24 * self.scene.simulation.rays) / 1e9
+        """Memory for one emitter."""
+        return _memory_gb(self.scene.simulation, self.probes)
 
     def sequences_of(self, order: int) -> float:
         """The number of sequences of up to `order` walls that may mirror a path. On average an image is in front of
@@ -92,10 +88,7 @@ class SimulationSize:
     @property
     def extent(self) -> str:
         """A description of probes, pairs, data and memory."""
-        return (
-            f"about {self.probes:,} probes, {self.pairs:,} pairs, {_rounded(self.dataset_gb)} GB of data and "
-            f"{_rounded(self.memory_gb)} GB of memory per worker"
-        )
+        return f"about {_extent(self.scene.simulation, self.probes)}"
 
     def __str__(self) -> str:
         minutes = self.core_minutes
@@ -156,3 +149,37 @@ class SimulationSize:
 def _rounded(value: float) -> str:
     """The value rounded to two digits, but not finer than hundredths."""
     return f"{max(value, 0.01):.2g}" if value < 10 else f"{value:,.0f}"
+
+
+def _pair_energies(simulation: Simulation) -> int:
+    """The number of energies of one pair."""
+    return simulation.arrival_directions * len(OCTAVE_BANDS_HZ) * simulation.histogram_bins
+
+
+def _dataset_gb(simulation: Simulation, probes: int) -> float:
+    return 2 * probes * (probes - 1) * _pair_energies(simulation) * (1 + simulation.held_out_share) / 1e9
+
+
+def _memory_gb(simulation: Simulation, probes: int) -> float:
+    """Memory for one emitter: energies three times in single precision and once in half precision."""
+    return (14 * probes * _pair_energies(simulation) + 24 * simulation.rays) / 1e9
+
+
+def _extent(simulation: Simulation, probes: int) -> str:
+    data, memory = _rounded(_dataset_gb(simulation, probes)), _rounded(_memory_gb(simulation, probes))
+    return f"{probes:,} probes, {probes * (probes - 1):,} pairs, {data} GB of data and {memory} GB of memory per worker"
+
+
+def level_extent(scene: LevelScene, probes: int) -> str:
+    """A description of probes, pairs, data and memory of a level's simulation. Raises SceneFileError, with the field to
+    change, if that is too much."""
+    limits = (
+        (probes > MOST_PROBES, f"at most {MOST_PROBES:,} probes", "probes.spacing_m"),
+        (_memory_gb(scene.simulation, probes) > MOST_MEMORY_GB, f"at most {MOST_MEMORY_GB:g} GB of memory", _DATA),
+        (_dataset_gb(scene.simulation, probes) > MOST_DATASET_GB, f"at most {MOST_DATASET_GB:g} GB of data", _DATA),
+    )
+    extent = _extent(scene.simulation, probes)
+    for is_too_much, limit, field in limits:
+        if is_too_much:
+            raise SceneFileError(f"{scene.id}: {field}: {limit}, and this is {extent}")
+    return extent

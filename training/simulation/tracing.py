@@ -7,12 +7,18 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_amplitude, db_to_power
+from server.acoustics.reflections import mirror_gain_db
+from server.acoustics.surroundings import MeshSurroundings
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
-from training.data.dataset import SPEED_OF_SOUND
+from server.scene.mesh_geometry import MeshGeometry
+from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.images import images_in_height, images_in_plan
+from training.simulation.mesh_rays import MeshRayTracer
 from training.simulation.rays import RayTracer, sphere_directions, surface_shares
 
 _Floats = npt.NDArray[np.float64]
@@ -44,13 +50,54 @@ def _absorption_db_per_m(air: Air | None) -> _Floats:
     return np.zeros(len(OCTAVE_BANDS_HZ)) if air is None else air.absorption_db_per_m
 
 
+class _PlanImages:
+    """Image sources in a floor plan."""
+
+    def __init__(self, geometry: Geometry, receivers: _Floats, *, least_order: int, order: int) -> None:
+        self._plan = geometry.floor_plan
+        self._receivers = receivers
+        self._least_order, self._order = least_order, order
+        reflected, scattered = surface_shares(geometry)
+        self._specular_amplitudes = np.sqrt(np.prod([reflected, 1 - scattered], axis=0))
+
+    def find(self, emitter: _Floats) -> tuple[npt.NDArray[np.int64], _Floats, _Floats]:
+        """(image,) receivers, (image, xyz) positions, and (image, band) what surfaces leave of amplitudes."""
+        order = self._order
+        heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)
+        receiver, plan, walls = images_in_plan(self._plan, emitter[:2], self._receivers[:, :2], order)
+        reflections = walls[:, None] + level.sum(axis=1)
+        path, height = np.nonzero((reflections >= self._least_order) & (reflections <= order))
+        times = np.column_stack([walls[path], level[height]])
+        damping = np.prod(self._specular_amplitudes ** times[..., None], axis=1)
+        return receiver[path], np.column_stack([plan[path], heights[height]]), damping
+
+
+class _MeshImages:
+    """Image sources in a mesh, by one surface. Rays bring what more surfaces mirror."""
+
+    def __init__(
+        self, surroundings: MeshSurroundings, geometry: MeshGeometry, receivers: _Floats, *, least_order: int
+    ) -> None:
+        self._receivers = receivers
+        gains_db = mirror_gain_db(geometry.of_surfaces("absorption"), geometry.of_surfaces("scattering"))
+        self._finder = surroundings.first_reflections(gains_db) if least_order <= 1 else None
+
+    def find(self, emitter: _Floats) -> tuple[npt.NDArray[np.int64], _Floats, _Floats]:
+        """As of `_PlanImages`."""
+        if self._finder is None:
+            return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, len(OCTAVE_BANDS_HZ)))
+        found = self._finder.find(emitter, self._receivers)  # a path is the same in both directions
+        positions = self._receivers[found.emitter] + found.length_m[:, None] * found.departure
+        return found.emitter, positions, db_to_amplitude(found.gain_db)
+
+
 class RoomTracer:
     """Finds images and traces rays from any emitter to a fixed set of receivers (receiver, xyz). It has no state
     between traces."""
 
     def __init__(
         self,
-        geometry: Geometry,
+        geometry: Geometry | MeshGeometry,
         air: Air | None,
         receivers: _Floats,
         *,
@@ -58,29 +105,42 @@ class RoomTracer:
         image_order: int,
         arrival_directions: _Floats,
         least_order: int = 1,
+        surroundings: MeshSurroundings | None = None,
     ) -> None:
         """Specular paths of up to `image_order` reflections are found as images; those of fewer than `least_order` are
-        left out."""
-        self._plan = geometry.floor_plan
+        left out. In a mesh, the order is at most 1; its `surroundings` may be given if there are some already."""
         self._air = air
         self._receivers = np.asarray(receivers, dtype=np.float64)
         self._duration_s = duration_s
-        self._image_order = image_order
-        self._least_order = least_order
-        reflected, scattered = surface_shares(geometry)
-        self._specular_amplitudes = np.sqrt(np.prod([reflected, 1 - scattered], axis=0))
-        self._rays = RayTracer(
-            geometry,
-            self._receivers,
-            duration_s=duration_s,
-            image_order=image_order,
-            arrival_directions=arrival_directions,
-        )
+        self._images: _PlanImages | _MeshImages
+        self._rays: RayTracer | MeshRayTracer
+        if isinstance(geometry, MeshGeometry):
+            if image_order > GEOMETRIC_ORDER:
+                raise ValueError(f"image_order: a mesh has images by {GEOMETRIC_ORDER} surface, not by {image_order}")
+            here = MeshSurroundings(geometry.mesh) if surroundings is None else surroundings
+            self._images = _MeshImages(here, geometry, self._receivers, least_order=least_order)
+            self._rays = MeshRayTracer(
+                geometry,
+                self._receivers,
+                duration_s=duration_s,
+                image_order=image_order,
+                arrival_directions=arrival_directions,
+                tree=here.tree,
+            )
+        else:
+            self._images = _PlanImages(geometry, self._receivers, least_order=least_order, order=image_order)
+            self._rays = RayTracer(
+                geometry,
+                self._receivers,
+                duration_s=duration_s,
+                image_order=image_order,
+                arrival_directions=arrival_directions,
+            )
 
     @classmethod
     def of(
         cls,
-        scene: SceneFile,
+        scene: SimulatedScene,
         plan: SimulationPlan,
         receivers: _Floats,
         *,
@@ -90,14 +150,21 @@ class RoomTracer:
     ) -> "RoomTracer":
         """A tracer for the scene, with the effects of the plan. Duration and image order default to the plan's."""
         settings = scene.simulation
+        geometry: Geometry | MeshGeometry
+        if isinstance(scene, LevelScene):
+            geometry, surroundings = scene.place, scene.surroundings
+        else:
+            assert isinstance(scene, SceneFile)
+            geometry, surroundings = scene.geometry, None
         return cls(
-            scene.geometry if plan.scattering else scene.geometry.without_scattering(),
+            geometry if plan.scattering else geometry.without_scattering(),
             scene.air if plan.air_absorption else None,
             receivers,
             duration_s=settings.duration_s if duration_s is None else duration_s,
             image_order=plan.image_order if image_order is None else image_order,
             arrival_directions=sphere_directions(settings.arrival_directions),
             least_order=least_order,
+            surroundings=surroundings,
         )
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:
@@ -118,16 +185,8 @@ class RoomTracer:
     def images(self, emitter: _Floats) -> list[tuple[_Floats, _Floats]]:
         """Image positions (image, xyz) and amplitudes (image, band) for each receiver. Images that arrive after the
         duration are left out."""
-        order = self._image_order
-        heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)
-        receiver, plan, walls = images_in_plan(self._plan, emitter[:2], self._receivers[:, :2], order)
-        reflections = walls[:, None] + level.sum(axis=1)
-        path, height = np.nonzero((reflections >= self._least_order) & (reflections <= order))
-        receiver = receiver[path]
-        positions = np.column_stack([plan[path], heights[height]])
+        receiver, positions, damping = self._images.find(emitter)
         distance = np.linalg.norm(positions - self._receivers[receiver], axis=-1)
-        times = np.column_stack([walls[path], level[height]])
-        damping = np.prod(self._specular_amplitudes ** times[..., None], axis=1)
         amplitudes = damping * free_field_amplitude(distance, self._air)
         heard = distance < self._duration_s * SPEED_OF_SOUND
         of_each = [np.flatnonzero((receiver == index) & heard) for index in range(len(self._receivers))]

@@ -128,7 +128,7 @@ def test_bundles_stand_side_by_side_under_their_folders_names(two_levels, tiny_b
 def test_another_scene_is_refused(dataset, tiny_bundle):
     scene = dataset.scene.model_copy(update={"geometry": dataset.scene.geometry.model_copy(update={"height_m": 2.6})})
     with pytest.raises(DatasetError, match="not of the scene"):
-        require_same_scene(tiny_bundle, dataclasses.replace(dataset, scene=scene))
+        require_same_scene(tiny_bundle, dataclasses.replace(dataset, place=scene))
 
 
 def test_errors_of_every_level_are_recorded_and_the_bundle_still_loads(evaluation, two_levels, tmp_path):

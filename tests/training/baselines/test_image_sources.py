@@ -59,7 +59,7 @@ def test_how_many_images_are_exact_does_not_change_the_level(dataset):
     for order in (1, 5):
         simulation = dataset.scene.simulation.model_copy(update={"image_order": order})
         other = dataset.scene.model_copy(update={"simulation": simulation})
-        images = ImageSources(replace(dataset, scene=other))
+        images = ImageSources(replace(dataset, place=other))
         energies = [
             np.square(images.response(dataset.probes[a], dataset.probes[b], np.array([0, 2]), 0)).sum()
             for a, b in ((0, 1), (2, 5), (3, 4))

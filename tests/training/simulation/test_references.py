@@ -49,7 +49,7 @@ def test_no_direct_sound_through_a_wall(dataset):
     geometry = dataset.scene.geometry.model_copy(
         update={"corners": ((0, 0), (1.2, 0), (1.2, 2.9), (1.4, 2.9), (1.4, 0), (4, 0), (4, 3), (0, 3))}
     )
-    walled = dataclasses.replace(dataset, scene=dataset.scene.model_copy(update={"geometry": geometry}))
+    walled = dataclasses.replace(dataset, place=dataset.scene.model_copy(update={"geometry": geometry}))
     geometric = GeometricSound(walled)
     sides = walled.probes[:, 0] < 1.3
     assert 0 < sides.sum() < len(sides)

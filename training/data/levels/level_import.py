@@ -24,8 +24,8 @@ from training.data.levels.level_scene import (
     Door,
     EmitterPlace,
     LevelFile,
+    LevelGeometry,
     LevelScene,
-    MeshGeometry,
     SpawnArea,
 )
 from training.data.levels.level_source import LevelError, LevelSource
@@ -237,7 +237,7 @@ def _file(
         id=name or "level",
         name=path.stem,
         description=f"Imported from {path.name}: {len(seen.mesh.triangles):,} triangles, {rooms} with all doors shut.",
-        geometry=MeshGeometry(
+        geometry=LevelGeometry(
             mesh=MESH_FILE,
             materials=dict(materials),
             open_sky=is_open,

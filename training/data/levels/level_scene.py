@@ -1,24 +1,35 @@
 """The folder of an imported level: `scene.toml`, the mesh, and a mesh for each door.
 
 `scene.toml` is a scene file whose geometry is a mesh; its other tables are those of any scene file. Heights of probes
-are above the floor that is below them.
+are above the floor that is below them. Doors stand as they are at the beginning.
 """
 
 import json
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, ValidationError, model_validator
 
-from server.acoustics.mesh import MeshError, TriangleMesh
+from server.acoustics.geometry import Points
+from server.acoustics.mesh import LONGEST_NAME, MeshError, TriangleMesh
+from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.surroundings import MeshSurroundings
 from server.scene.geometry import Finite, Material, Point, Strict
 from server.scene.manifest import Air, Start
-from training.data.scene_file import Probes, SceneFileError, Simulation
+from server.scene.mesh_geometry import MeshGeometry
+from training.data.levels.probe_places import probe_places
+from training.data.scene_file import FEWEST_PROBES, Probes, SceneFile, SceneFileError, Simulation
 
 SCENE_FILE, MESH_FILE = "scene.toml", "geometry.npz"
+_SPEED_OF_SOUND = 343.0
+_Floats = npt.NDArray[np.float64]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+\.npz$")]
 
 
@@ -36,6 +47,14 @@ class Door(Strict):
     openness: Annotated[float, Field(ge=0, le=1)]
     surface_mass_kg_m2: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
 
+    def moved(self, vertices_m: _Floats) -> _Floats:
+        """(V, 3) vertices of the shut leaf where they are at the door's openness."""
+        if self.kind == "slide":
+            return vertices_m + self.openness * np.array(self.slide_m)
+        angle = math.radians(self.openness * self.angle_deg)
+        turn = np.array([(math.cos(angle), -math.sin(angle), 0), (math.sin(angle), math.cos(angle), 0), (0, 0, 1)])
+        return np.asarray((vertices_m - self.pivot) @ turn.T + self.pivot, dtype=np.float64)
+
 
 class EmitterPlace(Strict):
     name: Annotated[str, Field(min_length=1)]
@@ -50,7 +69,7 @@ class SpawnArea(Strict):
     high: Point
 
 
-class MeshGeometry(Strict):
+class LevelGeometry(Strict):
     """Surfaces of a level. Every material that its meshes name is in `materials`. `open_sky` says that sound may leave
     through its holes."""
 
@@ -76,7 +95,7 @@ class LevelFile(Strict):
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
     name: str
     description: str
-    geometry: MeshGeometry
+    geometry: LevelGeometry
     air: Air = Air()
     start: Start
     probes: Probes
@@ -90,6 +109,66 @@ class LevelScene:
     file: LevelFile
     mesh: TriangleMesh
     doors: tuple[TriangleMesh, ...]
+
+    @property
+    def id(self) -> str:
+        return self.file.id
+
+    @property
+    def air(self) -> Air:
+        return self.file.air
+
+    @property
+    def simulation(self) -> Simulation:
+        return self.file.simulation
+
+    @cached_property
+    def place(self) -> MeshGeometry:
+        """All surfaces, with the leaves of doors where they stand."""
+        known = self.file.geometry.materials
+        materials = {name: known[name] for name in self.mesh.materials}
+        vertices, triangles, surfaces = [self.mesh.vertices_m], [self.mesh.triangles], [self.mesh.surfaces]
+        for door, leaf in zip(self.file.geometry.doors, self.doors, strict=True):
+            names = []
+            for name in leaf.materials:
+                own = f"{name} of door {door.name}"[:LONGEST_NAME] if door.surface_mass_kg_m2 else name
+                mass = {"surface_mass_kg_m2": door.surface_mass_kg_m2} if door.surface_mass_kg_m2 else {}
+                materials[own] = known[name].model_copy(update=mass)
+                names.append(own)
+            numbers = np.array([list(materials).index(name) for name in names])
+            triangles.append(leaf.triangles + sum(map(len, vertices)))
+            vertices.append(door.moved(leaf.vertices_m))
+            surfaces.append(numbers[leaf.surfaces])
+        mesh = TriangleMesh(
+            np.concatenate(vertices), np.concatenate(triangles), np.concatenate(surfaces), tuple(materials)
+        )
+        return MeshGeometry(mesh, materials)
+
+    @cached_property
+    def surroundings(self) -> MeshSurroundings:
+        return MeshSurroundings(self.place.mesh, open_sky=self.file.geometry.open_sky)
+
+    @cached_property
+    def _paths(self) -> SoundPathFinder:
+        return self.surroundings.sound_paths(_SPEED_OF_SOUND)
+
+    def probe_positions(self, seed: int) -> _Floats:
+        """(probe, 3) positions in the air above floors; the same for the same seed. Raises SceneFileError if there are
+        too few."""
+        places = probe_places(self.surroundings, self.file.probes, np.random.default_rng([seed, 0]))
+        if len(places) < FEWEST_PROBES:
+            raise SceneFileError(
+                f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit above the floors, "
+                f"{self.file.probes.spacing_m:g} m apart and {self.file.probes.wall_clearance_m:g} m from all surfaces "
+                "(probes.wall_clearance_m)"
+            )
+        return places
+
+    def path_length_m(self, a: Points, b: Points) -> _Floats:
+        """(...,) lengths of the shortest paths of sound between points; straight ones where there is none."""
+        ends = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+        flat = [end.reshape(-1, 3) for end in ends]
+        return self._paths.describe(*flat).length_m.reshape(ends[0].shape[:-1])
 
     @classmethod
     def read(cls, folder: Path) -> "LevelScene":
@@ -115,6 +194,11 @@ class LevelScene:
                 raise SceneFileError(f"{path}: geometry.materials: {name!r} is missing, and a mesh has it")
         return cls(file, mesh, doors)
 
+    def copy_meshes(self, source: Path, folder: Path) -> None:
+        """Copy the meshes, but not the scene file, from one folder to another."""
+        for name in (self.file.geometry.mesh, *(door.mesh for door in self.file.geometry.doors)):
+            (folder / name).write_bytes((source / name).read_bytes())
+
     def write(self, folder: Path, comments: Mapping[str, str] | None = None) -> None:
         """Write the folder's files. `comments` go before the tables of these names, such as `geometry.materials.brick`.
 
@@ -126,6 +210,25 @@ class LevelScene:
             leaf.save(folder / door.mesh)
         lines = _table("", self.file.model_dump(mode="json", exclude_none=True), comments or {})
         (folder / SCENE_FILE).write_text("\n".join(lines).lstrip("\n") + "\n", encoding="utf-8")
+
+
+def is_same_scene(one: SceneFile | LevelScene, other: SceneFile | LevelScene) -> bool:
+    """Whether two scenes are the same in all that they say, and in their meshes."""
+    if not (isinstance(one, LevelScene) and isinstance(other, LevelScene)):
+        return one == other
+    meshes = [[mesh.to_bytes() for mesh in (each.mesh, *each.doors)] for each in (one, other)]
+    return one.file == other.file and meshes[0] == meshes[1]
+
+
+def read_scene(path: Path) -> SceneFile | LevelScene:
+    """Read a scene file, or a level by its folder or its scene file. Raises SceneFileError naming the file and the
+    field at fault."""
+    path = path / SCENE_FILE if path.is_dir() else path
+    try:
+        is_level = "mesh" in tomllib.loads(path.read_text(encoding="utf-8"))["geometry"]
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+        is_level = False  # `SceneFile.read` says what is wrong
+    return LevelScene.read(path.parent) if is_level else SceneFile.read(path)
 
 
 def _table(name: str, content: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:

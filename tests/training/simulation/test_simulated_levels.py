@@ -1,0 +1,211 @@
+"""Levels are simulated as floor plans are: the apartment as a level gives the data of the apartment."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+from typer.testing import CliRunner
+
+from server.acoustics.decibels import power_to_db
+from server.scene.geometry import Material
+from server.scene.mesh_geometry import MeshGeometry
+from training.cli.main import app
+from training.data.dataset import Dataset, DatasetError
+from training.data.levels.level_scene import Door, LevelFile, LevelGeometry, LevelScene, read_scene
+from training.data.levels.probe_places import floors_of
+from training.data.scene_file import SceneFile, SceneFileError
+from training.parallel.jobs import open_jobs
+from training.simulation.direct_paths import DirectPaths
+from training.simulation.planner import plan_of_level
+from training.simulation.rays import sphere_directions
+from training.simulation.references import References
+from training.simulation.run import prepared, simulate
+from training.simulation.tracing import RoomTracer
+
+APARTMENT = SceneFile.read(Path(__file__).resolve().parents[3] / "training/scenes/apartment.toml")
+BRIEF = APARTMENT.simulation.model_copy(
+    update={"rays": 300, "duration_s": 0.3, "arrival_directions": 6, "yaws": 1, "sample_rate": 16_000}
+)
+PROBES = APARTMENT.probes.model_copy(update={"spacing_m": 2.0, "wall_clearance_m": 0.3})
+
+
+def level_of(doors=(), leaves=()):
+    place = MeshGeometry.of_plan(APARTMENT.geometry)
+    geometry = LevelGeometry(mesh="geometry.npz", materials=dict(place.materials), doors=doors)
+    file = LevelFile(
+        id="level",
+        name="The apartment",
+        description="",
+        geometry=geometry,
+        start=APARTMENT.start,
+        probes=PROBES,
+        simulation=BRIEF,
+    )
+    return LevelScene(file, place.mesh, leaves)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("level") / "scene"
+    level_of().write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def dataset(folder, tmp_path_factory):
+    with open_jobs(None, threads=1) as jobs, Progress(disable=True) as progress:
+        return simulate(folder, tmp_path_factory.mktemp("data") / "level", seed=3, jobs=jobs, progress=progress)
+
+
+def test_a_scene_is_read_by_its_folder_its_file_and_as_a_plan(folder):
+    assert isinstance(read_scene(folder), LevelScene)
+    assert isinstance(read_scene(folder / "scene.toml"), LevelScene)
+    with pytest.raises(SceneFileError, match=r"geometry\.mesh: is an imported level, and this takes a floor plan"):
+        SceneFile.read(folder / "scene.toml")
+    with pytest.raises(SceneFileError, match="cannot be read"):
+        read_scene(folder.parent / "none.toml")
+
+
+def test_probes_stand_above_the_floors_and_clear_of_surfaces():
+    level = level_of()
+    probes = level.probe_positions(3)
+    np.testing.assert_array_equal(probes, level.probe_positions(3))
+    assert not np.array_equal(probes, level.probe_positions(4))
+    low, high = PROBES.heights_m
+    assert np.all((probes[:, 2] >= low) & (probes[:, 2] <= high))
+    assert APARTMENT.geometry.floor_plan.contains(probes).all()
+    assert np.all(level.surroundings.tree.distance_m(probes) >= 0.3)
+    assert len(probes) > 6
+    assert floors_of(level.mesh) == [0.0]
+
+
+def test_its_dataset_is_that_of_any_scene(dataset):
+    assert dataset.place.id == "level"
+    again = Dataset.open(dataset.folder)
+    pairs = again.pairs(held_out=False)
+    energies = again.read_energy(pairs[:4])
+    assert energies.shape == (4, 6, 7, 75)
+    assert np.all(energies.sum(axis=(1, 3)) > 0)
+    assert np.all(np.isfinite(References(again).complete(*pairs[0])))
+    np.testing.assert_allclose(
+        again.onset_s, APARTMENT.geometry.floor_plan.path_length_m(again.probes[:, None], again.probes[None]) / 343,
+        atol=0.05 / 343,
+    )  # fmt: skip
+    with pytest.raises(DatasetError, match="holds a level, and this takes a floor plan"):
+        _ = again.scene
+
+
+def test_an_interrupted_simulation_goes_on_and_another_level_is_refused(dataset, folder, tmp_path):
+    with open_jobs(None, threads=1) as jobs, Progress(disable=True) as progress:
+        again = simulate(folder, dataset.folder, seed=3, jobs=jobs, progress=progress)
+        assert not again.remaining()
+        other = level_of()
+        turned = replace(other, mesh=other.mesh.only(np.arange(len(other.mesh.triangles) - 1)))
+        turned.write(tmp_path / "other")
+        with pytest.raises(DatasetError, match="holds another scene"):
+            simulate(tmp_path / "other", dataset.folder, seed=3, jobs=jobs, progress=progress)
+
+
+def test_a_level_sounds_as_its_plan():
+    """Images and direct paths are the plan's; rays bring its energy, and that of images by more surfaces than one."""
+    level, probes = level_of(), level_of().probe_positions(1)
+    plan = plan_of_level(level)
+    of_plan = APARTMENT.model_copy(update={"simulation": BRIEF})
+    here, there = (RoomTracer.of(scene, plan, probes[1:]) for scene in (of_plan, level))
+    for one, other in zip(here.images(probes[0]), there.images(probes[0]), strict=True):
+        order, other_order = (np.lexsort(each[0].T.round(6)) for each in (one, other))
+        np.testing.assert_allclose(one[0][order], other[0][other_order], atol=1e-6)
+        np.testing.assert_allclose(one[1][order], other[1][other_order], rtol=1e-6)
+    energies = [
+        each.energy(probes[0], rays=3000, rng=np.random.default_rng(1)).sum(axis=(1, 3)).mean(axis=0)
+        for each in (here, there)
+    ]
+    np.testing.assert_allclose(power_to_db(energies[0] / energies[1]), 0, atol=0.5)
+    one, other = (DirectPaths.of(scene, plan) for scene in (of_plan, level))
+    for listener in probes[1:]:
+        for found, expected in zip(other.images(probes[0], listener), one.images(probes[0], listener), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)
+
+
+def leaf():
+    """The doorway of the apartment, shut by a sheet."""
+    vertices = np.array([(4.1, 2.0, 0), (4.1, 3.0, 0), (4.1, 3.0, 2.8), (4.1, 2.0, 2.8)], dtype=float)
+    mesh = level_of().mesh
+    return type(mesh)(vertices, [(0, 1, 2), (0, 2, 3)], [0, 0], ("walls",))
+
+
+def door(openness, **changes):
+    return Door(
+        **{
+            "name": "middle", "mesh": "door0.npz", "kind": "swing", "pivot": (4.1, 2.0, 0.0), "angle_deg": 90.0,
+            "slide_m": (0.0, 1.0, 0.0), "openness": openness, "surface_mass_kg_m2": 12.0, **changes,
+        }
+    )  # fmt: skip
+
+
+def test_doors_stand_as_open_as_they_are():
+    hall, room = np.array((2.0, 2.5, 1.5)), np.array((6.0, 2.5, 1.5))
+    shut, ajar, wide = (level_of((door(openness),), (leaf(),)) for openness in (0.0, 0.75, 1.0))
+    sees = [bool(level.surroundings.is_visible(hall, room)) for level in (shut, ajar, wide)]
+    assert sees == [False, True, True]
+    heard_db = [
+        level.surroundings.sound_paths(343.0).find(hall, room[None]).screen_db[0, 0] for level in (shut, ajar, wide)
+    ]
+    assert heard_db[0] == -100
+    assert heard_db[2] > -6
+    corner = wide.place.mesh.vertices_m[-2]
+    np.testing.assert_allclose(corner, (3.1, 2.0, 2.8), atol=1e-12)
+    slid = level_of((door(0.5, kind="slide"),), (leaf(),)).place.mesh.vertices_m[-4:]
+    np.testing.assert_allclose(slid, np.add(leaf().vertices_m, (0, 0.5, 0)))
+    own = shut.place.materials["walls of door middle"]
+    assert isinstance(own, Material)
+    assert own.surface_mass_kg_m2 == 12.0
+    assert shut.place.materials["walls"].surface_mass_kg_m2 == APARTMENT.geometry.materials.walls.surface_mass_kg_m2
+    # What goes through the shut leaf is heard, by its mass.
+    positions, _ = DirectPaths.of(shut, plan_of_level(shut)).images(hall, room)
+    assert any(np.allclose(position, hall) for position in positions)
+
+
+def test_a_shut_door_keeps_the_energy_of_rays():
+    level = level_of((door(0.0),), (leaf(),))
+    inside, outside = np.array([(2.0, 2.5, 1.5)]), np.array([(6.0, 2.5, 1.5)])
+    tracer = RoomTracer.of(level, plan_of_level(level), np.concatenate([inside + 0.5, outside]))
+    energy = tracer.energy(inside[0], rays=300, rng=np.random.default_rng(1)).sum(axis=(1, 2, 3))
+    assert energy[0] > 0
+    assert energy[1] == 0
+
+
+def test_a_mesh_has_images_by_one_surface_only():
+    with pytest.raises(ValueError, match="image_order"):
+        RoomTracer(
+            MeshGeometry.of_plan(APARTMENT.geometry),
+            None,
+            np.ones((1, 3)),
+            duration_s=0.1,
+            image_order=2,
+            arrival_directions=sphere_directions(6),
+        )
+
+
+def test_the_plan_of_a_level_leaves_nothing_out(folder):
+    level = read_scene(folder)
+    plan = plan_of_level(level)
+    assert plan.scattering
+    assert plan.tail_start_s is None
+    assert prepared(level, seed=1, plan=plan).tail is None
+
+
+def test_the_command_line_takes_a_folder(folder, tmp_path):
+    runner = CliRunner()
+    planned = runner.invoke(app, ["plan", str(folder)])
+    assert planned.exit_code == 0
+    assert "probes" in planned.output
+    assert "levels are simulated with everything on" in " ".join(planned.output.split())
+    result = runner.invoke(app, ["simulate", str(folder), "-o", str(tmp_path / "data"), "--workers", "1"])
+    assert result.exit_code == 0, result.output
+    assert "pairs to train on" in result.output
+    assert (tmp_path / "data" / "geometry.npz").exists()
+    refused = runner.invoke(app, ["simulate", str(folder), "-o", str(tmp_path / "x"), "--effects", "scattering=off"])
+    assert refused.exit_code != 0
