@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from tests import visitor
-from tests.visitor import CHROMIUM, CHROMIUM_ARGUMENTS, free_port, level_db, listen, open_page, serving, start
+from tests.visitor import CHROMIUM, CHROMIUM_ARGUMENTS, level_db, listen, open_page, start
 
 page = visitor.page
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
@@ -25,12 +25,6 @@ def browser():
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*CHROMIUM_ARGUMENTS, *fake])
         yield browser
         browser.close()
-
-
-@pytest.fixture(scope="module")
-def server():
-    with serving(free_port()) as url:
-        yield url
 
 
 @pytest.fixture(scope="module")

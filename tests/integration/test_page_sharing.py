@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from tests import visitor
-from tests.visitor import free_port, level_db, listen, open_page, serving, start, visit
+from tests.visitor import level_db, listen, open_page, start, visit
 
 browser = visitor.browser
 page = visitor.page
 one_page = visitor.one_page
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
-
-
-@pytest.fixture(scope="module")
-def server():
-    with serving(free_port()) as url:
-        yield url
 
 
 IS_DRY = """() => {
