@@ -1,4 +1,5 @@
-"""`nafir-train import-level`: imports a level of a game, and reports on its mesh."""
+"""`nafir-train import-level` imports a level of a game and reports on its mesh; `nafir-train bundle-level` makes a
+scene bundle of it."""
 
 import json
 from pathlib import Path
@@ -70,3 +71,22 @@ def import_level(
             f"{output}: {len(imported.scene.mesh.triangles):,} triangles, {named} materials, {doors} "
             f"door{'' if doors == 1 else 's'}; drawn in {output / PICTURE_FILE}"
         )
+
+
+def bundle_level(
+    scene: Annotated[Path, typer.Argument(help="Folder of an imported level, or its scene.toml.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)],
+    as_json: Json = False,
+) -> None:
+    """Write an imported level as a scene bundle without a field: a server renders its direct sound, what comes round
+    edges and through walls, and first reflections."""
+    from training.bundling.level_bundle import bundle_of_level
+    from training.data.levels.level_scene import LevelScene
+
+    bundle = bundle_of_level(LevelScene.read(scene if scene.is_dir() else scene.parent), output)
+    assert bundle.mesh is not None
+    count = len(bundle.mesh.triangles)
+    if as_json:
+        typer.echo(json.dumps({"scene": bundle.id, "digest": bundle.digest, "triangles": count}))
+    else:
+        typer.echo(f"{output}: scene {bundle.id}, {count:,} triangles, digest {bundle.digest[:12]}")

@@ -17,7 +17,7 @@ from training.cli import benchmarking, watching
 from training.cli import evaluating as evaluation
 from training.cli import simulating as simulation
 from training.cli.importing import importing
-from training.cli.importing_levels import import_level
+from training.cli.importing_levels import bundle_level, import_level
 from training.cli.listening import listening_test
 from training.cli.options import Cluster, Json, Seed
 from training.cli.options import progress_bar as _progress
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 app = StrictTyper(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(importing, name="import")
 app.command()(import_level)
+app.command()(bundle_level)
 app.command()(simulation.plan)
 app.command()(listening_test)
 
