@@ -3,7 +3,9 @@
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -26,16 +28,9 @@ STATE SAMPLE PROBLEM` with the samples heard by then, the messages of the server
 While its connection is lost it adds an emitter."""
 
 
-def unity_command(request, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
-    program = request.getfixturevalue("unity")
-    return [MONO, program, "hear", url, "flat", losing.CLIP, str(seconds), output, str(give_up_after_s)]
-
-
-def godot_command(_, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
-    driver = CLIENTS.parent / "tests" / "clients" / "godot_losses.gd"
-    given = {"url": url, "clip": losing.CLIP, "seconds": seconds, "output": output, "give-up-after": give_up_after_s}
-    options = [f"--{name}={value}" for name, value in given.items()]
-    return [GODOT, "--path", CLIENTS / "godot", "-s", driver, *options]
+@pytest.fixture(scope="module")
+def godot() -> str | None:
+    return GODOT
 
 
 @pytest.fixture(scope="module")
@@ -44,23 +39,32 @@ def unreal(tmp_path_factory) -> Path:
     return compiled(driver, tmp_path_factory.mktemp("unreal") / "losses")
 
 
-def unreal_command(request, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+def unity_command(program: Path, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+    return [MONO, program, "hear", url, "flat", losing.CLIP, str(seconds), output, str(give_up_after_s)]
+
+
+def godot_command(program: str, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+    driver = CLIENTS.parent / "tests" / "clients" / "godot_losses.gd"
+    given = {"url": url, "clip": losing.CLIP, "seconds": seconds, "output": output, "give-up-after": give_up_after_s}
+    options = [f"--{name}={value}" for name, value in given.items()]
+    return [program, "--path", CLIENTS / "godot", "-s", driver, *options]
+
+
+def unreal_command(program: Path, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
     host, port = url.removeprefix("ws://").removesuffix("/v1/stream").split(":")
-    program = request.getfixturevalue("unreal")
     return [program, host, port, losing.CLIP, str(seconds), output, str(give_up_after_s)]
 
 
-@pytest.fixture(
-    params=[
-        pytest.param(unity_command, marks=needs_mono, id="unity"),
-        pytest.param(godot_command, marks=needs_godot, id="godot"),
-        pytest.param(unreal_command, marks=needs_compiler, id="unreal"),
-    ]
-)
-def player(request) -> Player:
+COMMANDS = {"unity": unity_command, "godot": godot_command, "unreal": unreal_command}
+"""By the name of the fixture of its program."""
+NEEDS = {"unity": needs_mono, "godot": needs_godot, "unreal": needs_compiler}
+ENGINES = [pytest.param(name, marks=NEEDS[name]) for name in COMMANDS]
+
+
+def player_of(engine: str, program: Path | str) -> Player:
     @contextmanager
     def play(address: str, seconds: float, output: Path, *, give_up_after_s: float = 60.0) -> Iterator[Iterator[str]]:
-        command = request.param(request, f"ws://{address}/v1/stream", seconds, output, give_up_after_s)
+        command = COMMANDS[engine](program, f"ws://{address}/v1/stream", seconds, output, give_up_after_s)
         with subprocess.Popen(command, env=QUIET, stdout=subprocess.PIPE, text=True) as process:
             try:
                 yield process.stdout
@@ -70,6 +74,11 @@ def player(request) -> Player:
     return play
 
 
+@pytest.fixture(params=ENGINES)
+def player(request) -> Player:
+    return player_of(request.param, request.getfixturevalue(request.param))
+
+
 def assert_only_a_gap(path: Path, sample: int) -> None:
     heard = losing.read(path)
     gap = losing.gap_around(heard, sample)
@@ -77,21 +86,48 @@ def assert_only_a_gap(path: Path, sample: int) -> None:
     losing.assert_same_clip_position(heard, gap)
 
 
-def test_a_lost_connection_costs_a_fade_and_nothing_else(player, served, tmp_path):
-    with LossyProxy(served).running() as network, player(network.address, 6, tmp_path / "heard") as lines:
+@dataclass(frozen=True)
+class Loss:
+    """What was heard in six seconds in which the connection was lost: a file, the sample at which it was there again,
+    what was asked for meanwhile, and what was counted."""
+
+    heard: Path
+    sample: int
+    added: str
+    counted: list[str]
+
+
+def lose(player: Player, address: str, heard: Path) -> Loss:
+    with LossyProxy(address).running() as network, player(network.address, 6, heard) as lines:
         until(lines, "emitter_added source")
         time.sleep(2.0)
         network.cut()
         assert "Waiting" in until(lines, "state")
         _, state, sample, *_ = until(lines, "state", "emitter_added").split()
         assert state == "Live"
-        # What was asked for meanwhile, and nothing that was there already.
-        assert until(lines, "emitter_added") == "emitter_added late"
-        _, state, reconnections, resumptions, _, waiting_s, round_trip_s, _, level = until(lines, "end").split()
+        return Loss(heard, int(sample), until(lines, "emitter_added"), until(lines, "end").split()[1:])
+
+
+@pytest.fixture(scope="module")
+def losses(request, served, tmp_path_factory) -> Iterator[dict[str, Future[Loss]]]:
+    """By engine. All of them at once, for they mostly wait."""
+    missing = {name for name, needs in NEEDS.items() if needs.args[0]}
+    players = {name: player_of(name, request.getfixturevalue(name)) for name in COMMANDS if name not in missing}
+    folder = tmp_path_factory.mktemp("heard")
+    with ThreadPoolExecutor(len(COMMANDS)) as pool:
+        yield {name: pool.submit(lose, player, served, folder / name) for name, player in players.items()}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_lost_connection_costs_a_fade_and_nothing_else(losses, engine):
+    loss = losses[engine].result()
+    # What was asked for meanwhile, and nothing that was there already.
+    assert loss.added == "emitter_added late"
+    state, reconnections, resumptions, _, waiting_s, round_trip_s, _, level = loss.counted
     assert (state, reconnections, resumptions, level) == ("Live", "1", "1", "standard")
     assert float(waiting_s) < 0.15  # what came at once after the gap does not stay in the buffer
     assert 0 < float(round_trip_s) < 1
-    assert_only_a_gap(tmp_path / "heard", int(sample))
+    assert_only_a_gap(loss.heard, loss.sample)
 
 
 @pytest.mark.long
