@@ -43,8 +43,8 @@ _COMPUTING = (
 )
 """Files that take long, by how their names begin, in this order: what begins last should be short. The first makes the
 bundle for which others of its folder would wait, if they came next."""
-_WAITING = ("page/", "integration/", "clients/")
-"""Files that take long as well, but wait: for browsers, and for sound to pass."""
+_WAITING = ("page/", "integration/", "clients/", "api/", "soak/")
+"""Files that take long as well, but wait: for browsers, for sound and for time to pass."""
 
 _TIMED = ("bench/", "integration/", "runtime/", "streaming/")
 """Folders with `timed` tests: TIMED of the Makefile."""
