@@ -110,8 +110,11 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[dict[str, StreamHost]]:
-        loaded = dict(await asyncio.to_thread(load_scenes, settings.bundles) if scenes is None else scenes)
-        folder = None if settings.bundle_folder is None else BundleFolder(settings.bundle_folder, dict(loaded))
+        keys = settings.read_bundle_keys()
+        load = partial(load_scenes, settings.bundles, keys=keys)
+        loaded = dict(await asyncio.to_thread(load) if scenes is None else scenes)
+        watched = settings.bundle_folder
+        folder = None if watched is None else BundleFolder(watched, dict(loaded), keys=keys)
         if folder is not None:
             loaded |= (await asyncio.to_thread(folder.look, is_first=True)).loaded
         heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs

@@ -14,6 +14,7 @@ from pathlib import Path
 from server.core.errors import BundleError
 from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import MANIFEST_FILE, Bundle
+from server.scene.signatures import BundleKeys
 
 _logger = logging.getLogger(__name__)
 
@@ -49,10 +50,12 @@ class _Known:
 
 class BundleFolder:
     """A scene of the folder takes the place of one of the same id among `others`, which comes back when the folder no
-    longer has it. Of two sub-folders with one id, the first by name has it."""
+    longer has it. Of two sub-folders with one id, the first by name has it. Where there are `keys`, one of them has to
+    have signed each bundle."""
 
-    def __init__(self, folder: Path, others: Mapping[str, FieldsByLevel]) -> None:
+    def __init__(self, folder: Path, others: Mapping[str, FieldsByLevel], *, keys: BundleKeys | None = None) -> None:
         self._folder = folder
+        self._keys = keys
         self._others = others
         self._known: dict[Path, _Known] = {}
 
@@ -114,7 +117,7 @@ class BundleFolder:
     def _load(self, path: Path) -> FieldsByLevel | None:
         """A bundle's levels; None, and a line in the log, if it cannot be served."""
         try:
-            bundle = Bundle.load(path)
+            bundle = Bundle.load(path, keys=self._keys)
             others = (other for other, known in self._known.items() if known.scene == bundle.id and other != path)
             if (other := next(others, None)) is not None:
                 problem = f"is {bundle.id!r}, and so is that of {other}; leave one out, or change one"

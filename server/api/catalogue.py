@@ -15,18 +15,20 @@ from server.protocol.codecs import libopus
 from server.protocol.codecs.registry import CODECS, OPUS_MEANING
 from server.protocol.server_messages import Place, SceneDescription
 from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
+from server.scene.signatures import BundleKeys
 
 _logger = logging.getLogger(__name__)
 
 
-def load_scenes(bundles: Iterable[Path]) -> dict[str, FieldsByLevel]:
-    """Quality levels by scene id, of the bundled scenes and of `bundles`, which replace bundled scenes of the same id.
+def load_scenes(bundles: Iterable[Path], *, keys: BundleKeys | None = None) -> dict[str, FieldsByLevel]:
+    """Quality levels by scene id, of the bundled scenes and of `bundles`, which replace bundled scenes of the same id,
+    and have to be signed by one of the `keys` if there are any.
 
     Raises BundleError for the first bundle that is damaged or has the id of another of `bundles`.
     """
     own: dict[str, Bundle] = {}  # read first, so that their errors appear before the bundled graphs are loaded
     for folder in bundles:
-        bundle = Bundle.load(folder)
+        bundle = Bundle.load(folder, keys=keys)
         other = own.setdefault(bundle.id, bundle)
         if other.folder.resolve() != folder.resolve():
             problem = f"is {bundle.id!r}, and so is that of {other.folder}; leave one out, or change one"

@@ -27,6 +27,7 @@ from server.core.near_names import suggestion
 from server.core.numerals import parse_decimal, parse_integer
 from server.protocol.client_messages import MOST_LISTENERS
 from server.runtime.open_files import allow_connections
+from server.scene.signatures import BundleKeys
 
 _PREFIX = "NAFIR_"
 _SERVICE_LINK = re.compile(r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?")
@@ -119,6 +120,9 @@ class Settings(BaseSettings):
     while the server runs; streams that are open finish with what they have."""
     bundle_folder_s: Annotated[float, Field(ge=0.1)] = 5.0
     """Seconds between two looks at `bundle_folder`. What has changed is loaded at the look after."""
+    bundle_keys: Path | None = None
+    """File of public keys as minisign writes them. With it only bundles that one of them has signed are served
+    (`nafir sign-bundle`), besides those that come with the package."""
     clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, besides those that come with the package."""
     clips_folder: Path | None = None
@@ -224,6 +228,10 @@ class Settings(BaseSettings):
             return parse_decimal(value) if float in kinds else parse_integer(value)
         return value
 
+    def read_bundle_keys(self) -> BundleKeys | None:
+        """The keys that bundles have to be signed by; None if any bundle is served. Raises NafirError."""
+        return None if self.bundle_keys is None else BundleKeys.read(self.bundle_keys)
+
     @property
     def is_loopback(self) -> bool:
         """Whether `host` stands for this machine alone."""
@@ -272,7 +280,7 @@ def checked_settings(given: Mapping[str, Any]) -> Settings:
     for name in ("clips", "hrtfs"):
         for path in getattr(settings, name):
             require_readable(path, name)
-    for name in ("keys_file", "jwt_keys_file"):
+    for name in ("keys_file", "jwt_keys_file", "bundle_keys"):
         if (path := getattr(settings, name)) is not None:
             require_readable(path, name)
     if settings.clips_folder is not None:

@@ -23,7 +23,7 @@ def loaded_app(
     loaded."""
     with CompilingProcess() as compiler:
         compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
-        scenes = load_scenes(settings.bundles)
+        scenes = load_scenes(settings.bundles, keys=settings.read_bundle_keys())
         if not scenes:
             raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
         hrtfs = load_hrtfs(settings.hrtfs, scenes)

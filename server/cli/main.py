@@ -294,6 +294,24 @@ def bundle_schema() -> None:
 
 
 @app.command()
+def sign_bundle(
+    key: Annotated[Path, typer.Option(help="File of the secret key, as minisign writes it with -W.", metavar="FILE")],
+    folder: Annotated[Path | None, typer.Argument(help="Folder of a scene bundle.", show_default=False)] = None,
+    comment: Annotated[str, typer.Option(help="A line that is signed as well.")] = "",
+    new_key: Annotated[bool, typer.Option(help="Make the key first, and FILE.pub with its public half.")] = False,
+) -> None:
+    """Sign a scene bundle, for servers that take signed ones alone (NAFIR_BUNDLE_KEYS)."""
+    from server.scene.signatures import SigningKey, sign_bundle
+
+    if folder is None and not new_key:
+        raise NafirError("FOLDER: name the bundle to sign, or make a key with --new-key")
+    if new_key:
+        typer.echo(f"the public key is in {SigningKey.new().write(key)}")
+    if folder is not None:
+        typer.echo(f"signed: {sign_bundle(folder, SigningKey.read(key), comment)}")
+
+
+@app.command()
 def render(
     scene: Scene,
     emitter: Annotated[

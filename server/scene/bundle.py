@@ -28,6 +28,7 @@ from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
 from server.scene.geometry import Material
 from server.scene.manifest import ARRAYS_FILE, Manifest, SceneMesh
+from server.scene.signatures import MOST_SIGNATURE_BYTES, SIGNATURE_FILE, BundleKeys
 
 MANIFEST_FILE = "scene.json"
 BUNDLED = Path(__file__).parent / "bundles"
@@ -61,11 +62,14 @@ class Bundle:
     mesh: TriangleMesh | None = None
 
     @classmethod
-    def load(cls, folder: Path) -> "Bundle":
-        """Read and check a bundle. Raises BundleError, which names the file and the field, for anything missing,
-        damaged or out of bounds."""
+    def load(cls, folder: Path, *, keys: BundleKeys | None = None) -> "Bundle":
+        """Read and check a bundle, which one of the `keys` has to have signed if there are any. Raises BundleError,
+        which names the file and the field, for anything missing, damaged or out of bounds."""
         path = folder / MANIFEST_FILE
         text = _read(folder, MANIFEST_FILE, MOST_MANIFEST_BYTES)
+        if keys is not None:
+            # guard: nothing of a bundle is read before its signature is checked
+            keys.require(folder, text, _read_signature(folder))
         try:
             manifest = Manifest.model_validate_json(text)
         except ValidationError as exc:
@@ -196,6 +200,13 @@ def _mesh(folder: Path, described: SceneMesh, data: bytes) -> TriangleMesh:
 
 def _noise_bytes(samples: int) -> int:
     return MOST_HEADER_BYTES + 2 * samples * _WIDEST_SAMPLE_BYTES
+
+
+def _read_signature(folder: Path) -> bytes:
+    if not (folder / SIGNATURE_FILE).exists():
+        problem = "is missing: bundle_keys asks for signed bundles (`nafir sign-bundle`)"
+        raise BundleError(folder / SIGNATURE_FILE, "file", problem)
+    return _read(folder, SIGNATURE_FILE, MOST_SIGNATURE_BYTES)
 
 
 def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None) -> bytes:

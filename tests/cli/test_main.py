@@ -18,6 +18,7 @@ import soundfile
 
 from server.acoustics.geometry import Pose
 from server.api.asyncapi import document
+from server.api.settings import Settings
 from server.assets.clips import ClipLibrary
 from server.cli.main import main
 from server.field.field import AcousticField
@@ -27,9 +28,10 @@ from server.rendering.hrtf import KEMAR, kemar
 from server.responses.direct_sound import DirectSound
 from server.responses.impulse_response import ImpulseResponse, IrQuery
 from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
-from server.scene.bundle import write_bundle
+from server.scene.bundle import BUNDLED, Bundle, write_bundle
 from server.scene.manifest import QualityLevel
 from server.scene.manifest_schema import manifest_schema
+from server.scene.signatures import SIGNATURE_FILE
 from tests.directional_flat import write_directional
 
 NAFIR = [sys.executable, "-c", "from server.cli.main import main; main()"]
@@ -426,7 +428,7 @@ def test_a_damaged_bundle_leaves_no_traceback(bundle_copy):
 def test_a_port_in_use_ends_serve_at_once_before_anything_is_loaded_and_nothing_is_said_to_be_served(
     nafir, monkeypatch
 ):
-    monkeypatch.setattr("server.api.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
+    monkeypatch.setattr("server.api.catalogue.load_scenes", lambda *_, **__: pytest.fail("scenes are loaded"))
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -438,7 +440,7 @@ def test_a_port_in_use_ends_serve_at_once_before_anything_is_loaded_and_nothing_
 
 @pytest.mark.parametrize("option", ["clip", "hrtf"])
 def test_serve_looks_at_the_files_it_is_given_before_anything_else(nafir, monkeypatch, tmp_path, option):
-    monkeypatch.setattr("server.api.catalogue.load_scenes", lambda _: pytest.fail("scenes are loaded"))
+    monkeypatch.setattr("server.api.catalogue.load_scenes", lambda *_, **__: pytest.fail("scenes are loaded"))
     monkeypatch.setattr("server.api.listeners.bind", lambda *_: pytest.fail("a port is bound"))
     check_error(nafir("serve", "--port", 0, f"--{option}", tmp_path / "missing.x"), f"{option}s", "missing.x")
 
@@ -535,3 +537,20 @@ def test_serve_serves_until_it_is_told_to_stop(bundle):
         server.send_signal(signal.SIGTERM)
         server.communicate(timeout=30)
     assert server.returncode == 0
+
+
+def test_bundles_are_signed_for_servers_that_take_signed_ones_alone(nafir, tmp_path, monkeypatch):
+    folder = shutil.copytree(BUNDLED / "open-field", tmp_path / "open-field")
+    key = tmp_path / "own"
+    code, told, _ = nafir("sign-bundle", folder, "--key", key, "--new-key", "--comment", "of ours")
+    assert code == 0
+    assert told == f"the public key is in {key}.pub\nsigned: {folder / SIGNATURE_FILE}\n"
+    assert "trusted comment: of ours" in (folder / SIGNATURE_FILE).read_text()
+    monkeypatch.setenv("NAFIR_BUNDLE_KEYS", f"{key}.pub")
+    assert Bundle.load(folder, keys=Settings().read_bundle_keys()).id == "open-field"
+    check_error(nafir("sign-bundle", "--key", key), "FOLDER: name the bundle", "--new-key")
+    check_error(nafir("sign-bundle", folder, "--key", key, "--new-key"), f"{key}: File exists")
+    (folder / SIGNATURE_FILE).unlink()
+    check_error(nafir("serve", "--bundle", folder, "--port", 0), SIGNATURE_FILE, "is missing", "nafir sign-bundle")
+    monkeypatch.setenv("NAFIR_BUNDLE_KEYS", str(tmp_path / "nothing"))
+    check_error(nafir("serve", "--port", 0), "nothing")

@@ -193,7 +193,7 @@ if command -v caddy >/dev/null; then
     secrets=$state/secrets/keys
     mkdir -p "$secrets"
     rm -f "$secrets/keys.json"
-    run_podman volume rm --force nafir-cache >/dev/null
+    run_podman volume rm --force nafir-cache >/dev/null 2>&1 || true
     nafir_keys() { run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$secrets:/keys" --user 0 "$image" keys "$@"; }
     metrics_key=$(nafir_keys create --file /keys/keys.json --scope metrics)
     chmod 644 "$secrets/keys.json"
