@@ -61,7 +61,7 @@ def parse_orientation(text: str, field: str) -> Quaternion:
     largest = max(map(abs, components))
     # guard: a query's orientation is one
     if not largest:
-        raise RequestError("malformed_pose", f"{field}: a quaternion of length zero has no direction", field=field)
+        raise RequestError("malformed_pose", f"{field} must be a quaternion of non-zero length", field=field)
     _, exponent = math.frexp(largest)  # by powers of two, which leaves the components' ratios exact
     return Quaternion(*(math.ldexp(component, -exponent) for component in components))
 
