@@ -40,6 +40,7 @@ _SHORTEST_M = 0.05
 _RADIUS_M, _LIFT_M = 0.01, 1e-3
 _LEAST_RAD = math.radians(2)
 _HALVINGS = 8
+_INSET_M = 0.01
 _SAME_VERTEX_M, _SAME_LINE_M = 1e-6, 1e-3
 _PARALLEL = 1 - 1e-8
 _CELL_M = 1.0
@@ -174,7 +175,8 @@ def _reach(tree: MeshTree, edges: _Edges, points: _Points) -> tuple[_Floats, _Fl
     for point in range(len(points.edge) - 2, -1, -1):
         if joins_after[point]:
             high[point] = high[point + 1]
-    return low, high
+    # At its very end, an edge touches what it ends at, which would be in the way.
+    return np.minimum(low + _INSET_M, points.at), np.maximum(high - _INSET_M, points.at)
 
 
 def _edges(mesh: TriangleMesh) -> _Edges:

@@ -27,10 +27,10 @@ UNHEARD_DB = -100.0
 """The level of sound to which no path leads."""
 MOST_BENDS = 16
 """A path with more bends is not drawn taut."""
-_SWEEPS = 30
+_SWEEPS = 20
 _STILL_M = 1e-5
 # Where a taut path is blocked, its bends move as far as nothing is in the way, in so many steps.
-_GUARDED_SWEEPS, _SHORTER_STEPS, _GUARDED_STILL_M = 4, 5, 1e-3
+_GUARDED_SWEEPS, _SHORTER_STEPS, _GUARDED_STILL_M = 2, 2, 1e-3
 _UNKNOWN, _SEEN, _HIDDEN = 0, 1, 2
 
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_reflections_kernel import Patches, find_patch_reflections, join
-from server.acoustics.mesh_tree import MeshTree, planes_of
+from server.acoustics.mesh_reflections_kernel import Patches, find_patch_reflections
+from server.acoustics.mesh_tree import MeshTree, fitted_planes, flatness_m, patches_of
 from server.acoustics.mesh_tree_kernel import STACK
 from server.acoustics.reflections import FirstEcho, Reflections
 
@@ -20,8 +19,6 @@ _Integers = npt.NDArray[np.int32]
 
 MOST_REFLECTIONS = 64
 """The most reflections of an emitter that are found. Larger patches are tried first."""
-# Vertices nearer to each other than this, on a grid of that size, are one.
-_SAME_VERTEX_M = 1e-6
 # A patch with less area than this mirrors nothing that is heard.
 _LEAST_M2 = 1e-4
 
@@ -84,20 +81,6 @@ class MeshWallLosses:
         return lets_through & np.array([len(each) > 0 for each in walls], np.bool_), losses_db
 
 
-def patches_of(mesh: TriangleMesh) -> _Integers:
-    """(T,) the number of the patch to which each triangle belongs."""
-    places = np.rint(mesh.vertices_m / _SAME_VERTEX_M)
-    _, vertex = np.unique(places, axis=0, return_inverse=True)
-    corners = vertex.reshape(-1)[mesh.triangles]
-    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-    owners = np.repeat(np.arange(len(corners), dtype=np.int32), 3)
-    order = np.lexsort((sides[:, 1], sides[:, 0]))
-    labels = np.arange(len(corners), dtype=np.int32)
-    join(sides[order].astype(np.int64), owners[order], planes_of(mesh), labels)
-    _, patches = np.unique(labels, return_inverse=True)
-    return np.asarray(patches.reshape(-1), dtype=np.int32)
-
-
 def first_echo_of(patches: Patches) -> FirstEcho:
     """The lower bound of first reflections over the planes of all patches, which mirror on both sides."""
     normals = patches.normals.T
@@ -113,15 +96,13 @@ def mirrors_of(tree: MeshTree) -> Patches:
     low, high = np.full((len(areas), 3), np.inf), np.full((len(areas), 3), -np.inf)
     np.minimum.at(low, of_triangle, mesh.corners_m.min(axis=1))
     np.maximum.at(high, of_triangle, mesh.corners_m.max(axis=1))
-    # The largest triangle has the most exact normal.
-    widest = np.lexsort((-mesh.areas_m2, of_triangle))
-    widest = widest[np.searchsorted(of_triangle[widest], kept)]
-    normals = mesh.normals[widest]
+    normals, offsets = fitted_planes(mesh, of_triangle)
     numbers = np.full(len(areas), -1, np.int32)
     numbers[kept] = np.arange(len(kept))
     return Patches(
-        np.ascontiguousarray(normals.T),
-        np.sum(normals * mesh.corners_m[widest, 0], axis=-1),
+        np.ascontiguousarray(normals[kept].T),
+        np.ascontiguousarray(offsets[kept]),
         np.ascontiguousarray(np.concatenate([low, high], axis=1)[kept].T),
         numbers[of_triangle][tree.tree.numbers],
+        flatness_m(mesh),
     )

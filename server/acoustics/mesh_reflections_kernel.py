@@ -13,44 +13,17 @@ from server.kernels.compiled import compiled
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int32]
 
-_MARGIN_M = 1e-6
-
 
 class Patches(NamedTuple):
     """Planes by unit `normals` (xyz, patch) and `offsets` (patch,) along them, `bounds` (6, patch), and `of_rows`
-    (triangle,), the patch of each triangle in the order of the tree (-1 for none)."""
+    (triangle,), the patch of each triangle in the order of the tree (-1 for none). What is nearer to a patch than
+    `margin_m` lies on it."""
 
     normals: Floats
     offsets: Floats
     bounds: Floats
     of_rows: Integers
-
-
-@compiled
-def join(sides: npt.NDArray[np.int64], owners: Integers, planes: Integers, labels: Integers) -> None:
-    """Give all coplanar triangles that are joined by sides the same label. `sides` (side, 2) are sorted, `owners`
-    (side,) are their triangles; `labels` (triangle,) are numbers of triangles, at first their own."""
-    begin = 0
-    for end in range(1, len(sides) + 1):
-        if end < len(sides) and sides[end, 0] == sides[begin, 0] and sides[end, 1] == sides[begin, 1]:
-            continue
-        for one in range(begin, end):
-            for other in range(one + 1, end):
-                if planes[owners[one]] == planes[owners[other]]:
-                    first, second = _root(labels, owners[one]), _root(labels, owners[other])
-                    labels[max(first, second)] = min(first, second)
-                    break  # the other one finds the next
-        begin = end
-    for triangle in range(len(labels)):
-        labels[triangle] = _root(labels, triangle)
-
-
-@compiled
-def _root(labels: Integers, triangle: int) -> int:
-    while labels[triangle] != triangle:
-        labels[triangle] = labels[labels[triangle]]
-        triangle = labels[triangle]
-    return triangle
+    margin_m: float
 
 
 @compiled
@@ -58,7 +31,7 @@ def _meets_patch(tree: Tree, patches: Patches, stack: Integers, patch: int, star
     """The row of the triangle of a patch that a line from `start` meets first, at `spot`; -1 if it meets another."""
     dx, dy, dz = spot[0] - start[0], spot[1] - start[1], spot[2] - start[2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    near = _MARGIN_M / length
+    near = patches.margin_m / length
     distance, row, _ = closest_hit(tree, stack, start[0], start[1], start[2], dx, dy, dz, 1e-3 * near, 1 + near, -1)
     if row < 0 or distance < 1 - near or patches.of_rows[row] != patch:
         return -1
@@ -98,12 +71,12 @@ def _try_all(patches: Patches, listener: Floats, emitter: Floats, is_near: npt.N
             (abs(between) >= COINCIDENT_M)
             # Both ends are on one side, or on the plane.
             & (abs(between) + 2 * TOUCH_M >= abs(l_off - e_off))
-            & (x >= bounds[0, patch] - _MARGIN_M)
-            & (y >= bounds[1, patch] - _MARGIN_M)
-            & (z >= bounds[2, patch] - _MARGIN_M)
-            & (x <= bounds[3, patch] + _MARGIN_M)
-            & (y <= bounds[4, patch] + _MARGIN_M)
-            & (z <= bounds[5, patch] + _MARGIN_M)
+            & (x >= bounds[0, patch] - patches.margin_m)
+            & (y >= bounds[1, patch] - patches.margin_m)
+            & (z >= bounds[2, patch] - patches.margin_m)
+            & (x <= bounds[3, patch] + patches.margin_m)
+            & (y <= bounds[4, patch] + patches.margin_m)
+            & (z <= bounds[5, patch] + patches.margin_m)
         )
 
 
@@ -151,8 +124,8 @@ def find_patch_reflections(
                 continue
             dx, dy, dz = near[0] - spot[0], near[1] - spot[1], near[2] - spot[2]
             rest = math.sqrt(dx * dx + dy * dy + dz * dz)
-            if rest > 2 * _MARGIN_M:
-                margin = _MARGIN_M / rest
+            if rest > 2 * patches.margin_m:
+                margin = patches.margin_m / rest
                 plane = tree.planes[hit]
                 if (
                     first_blocker(tree, stack, spot[0], spot[1], spot[2], dx, dy, dz, margin, 1 - margin, plane, -1)

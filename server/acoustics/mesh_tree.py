@@ -19,6 +19,7 @@ from server.acoustics.mesh_tree_kernel import (
     find_inside,
     find_sight,
     find_walls,
+    join,
 )
 
 _Floats = npt.NDArray[np.float64]
@@ -31,8 +32,12 @@ SAME_PLACE_M = 1e-6
 """Faces that a line meets within this are one: coplanar double faces, or the two triangles of an edge."""
 MOST_CROSSED = 256
 """The most faces that are told apart along a line. No sound is heard through as many."""
-# Planes whose normals and distances differ by less are the same.
-_SAME_NORMAL, _SAME_OFFSET_M = 1e-6, 1e-6
+# Planes whose normals differ by less are the same, if their distances do not differ.
+_SAME_NORMAL = 1e-5
+# Points this near to a plane, as a share of the largest coordinate, lie in it; at least as many metres.
+_FLATNESS = 1e-6
+# Vertices nearer to each other than this, on a grid of that size, are one.
+_SAME_VERTEX_M = 1e-6
 
 # In these directions it is looked whether a point is in the air, and most of them decide. None lies along an axis or in
 # a diagonal plane, as edges of buildings do.
@@ -137,18 +142,64 @@ def _pairs(a: Points, b: Points) -> tuple[_Floats, _Floats, tuple[int, ...]]:
     return flat[0], flat[1], starts.shape[:-1]
 
 
+def flatness_m(mesh: TriangleMesh) -> float:
+    """How far from a plane points may be that lie in it: what single precision makes of coordinates, at least a
+    micrometre."""
+    return _FLATNESS * max(1.0, float(np.abs(mesh.bounds_m).max()))
+
+
+def patches_of(mesh: TriangleMesh) -> _Integers:
+    """(T,) the number of the patch to which each triangle belongs: a group of coplanar triangles that are joined by
+    edges."""
+    places = np.rint(mesh.vertices_m / _SAME_VERTEX_M)
+    _, vertex = np.unique(places, axis=0, return_inverse=True)
+    corners = vertex.reshape(-1)[mesh.triangles]
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+    owners = np.repeat(np.arange(len(corners), dtype=np.int32), 3)
+    order = np.lexsort((sides[:, 1], sides[:, 0]))
+    labels = np.arange(len(corners), dtype=np.int32)
+    join(
+        sides[order].astype(np.int64),
+        owners[order],
+        np.array(mesh.corners_m),
+        np.array(mesh.normals),
+        np.array(mesh.areas_m2),
+        flatness_m(mesh),
+        labels,
+    )
+    _, patches = np.unique(labels, return_inverse=True)
+    return np.asarray(patches.reshape(-1), dtype=np.int32)
+
+
+def fitted_planes(mesh: TriangleMesh, patches: _Integers) -> tuple[_Floats, _Floats]:
+    """Unit normals (patch, 3), on the side to which the largest triangle of each patch shows its face, and distances
+    (patch,) of the planes from the origin. They are those of whole patches: the normal of one triangle would miss the
+    other end of a wall. A patch without area has no normal."""
+    largest = np.lexsort((-mesh.areas_m2, patches))
+    largest = largest[np.searchsorted(patches[largest], np.arange(patches.max() + 1))]
+    side = np.sign(np.sum(mesh.normals * mesh.normals[largest][patches], axis=-1, keepdims=True))
+    normals, middles = np.zeros((len(largest), 3)), np.zeros((len(largest), 3))
+    weights = mesh.areas_m2[:, None]
+    np.add.at(normals, patches, side * mesh.normals * weights)
+    np.add.at(middles, patches, mesh.corners_m.mean(axis=1) * weights)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals /= np.where(length > 0, length, 1.0)
+    areas = np.bincount(patches, mesh.areas_m2)[:, None]
+    middles /= np.where(areas > 0, areas, 1.0)
+    return normals, np.asarray(np.sum(normals * middles, axis=-1))
+
+
 def planes_of(mesh: TriangleMesh) -> _Integers:
     """(T,) the number of the plane in which each triangle lies, whichever side it faces. Triangles without area have
     numbers of their own."""
-    normals = np.array(mesh.normals)
+    patches = patches_of(mesh)
+    normals, offsets = fitted_planes(mesh, patches)
     # The first component that is not small is positive.
     large = np.abs(normals) > _SAME_NORMAL
-    lead = np.take_along_axis(normals, np.argmax(large, axis=-1)[:, None], axis=-1)
-    normals *= np.where(lead < 0, -1.0, 1.0)
-    offsets = np.sum(normals * mesh.corners_m[:, 0], axis=-1, keepdims=True)
-    rounded = np.rint(np.concatenate([normals / _SAME_NORMAL, offsets / _SAME_OFFSET_M], axis=-1)) + 0.0
-    _, planes = np.unique(rounded, axis=0, return_inverse=True)
-    planes = planes.reshape(-1)
+    lead = np.sign(np.take_along_axis(normals, np.argmax(large, axis=-1)[:, None], axis=-1))
+    rounded = np.concatenate([lead * normals / _SAME_NORMAL, lead * offsets[:, None] / flatness_m(mesh)], axis=-1)
+    _, planes = np.unique(np.rint(rounded) + 0.0, axis=0, return_inverse=True)
+    planes = planes.reshape(-1)[patches]
     flat = ~np.any(mesh.normals, axis=-1)
     planes[flat] = planes.max() + 1 + np.arange(np.count_nonzero(flat))
     return np.asarray(planes, dtype=np.int32)

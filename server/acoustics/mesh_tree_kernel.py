@@ -35,6 +35,8 @@ _DEEPEST_BY_AREA = 64
 # no reciprocal.
 _PADDING = 1e-12
 _LEAST_DIRECTION = 1e-300
+# Of coplanar triangles, the least cosine between normals: a sliver's has little to say.
+_SAME_TURN = 0.99
 _ROUNDING = 1 + 1e-15
 # Of two sides of a sheet that are hit within this share of the distance, the one that faces the ray is taken.
 _SAME_SHARE = 1e-9
@@ -54,6 +56,60 @@ class Tree(NamedTuple):
     corners: Floats
     numbers: Integers
     planes: Integers
+
+
+@compiled
+def join(
+    sides: npt.NDArray[np.int64],
+    owners: Integers,
+    corners: Floats,
+    normals: Floats,
+    areas: Floats,
+    flat_m: float,
+    labels: Integers,
+) -> None:
+    """Give all coplanar triangles that are joined by sides the same label. `sides` (side, 2) are sorted, `owners`
+    (side,) are their triangles; `labels` (triangle,) are numbers of triangles, at first their own."""
+    begin = 0
+    for end in range(1, len(sides) + 1):
+        if end < len(sides) and sides[end, 0] == sides[begin, 0] and sides[end, 1] == sides[begin, 1]:
+            continue
+        for one in range(begin, end):
+            for other in range(one + 1, end):
+                if _are_coplanar(corners, normals, areas, owners[one], owners[other], flat_m):
+                    first, second = _root(labels, owners[one]), _root(labels, owners[other])
+                    labels[max(first, second)] = min(first, second)
+                    break  # the other one finds the next
+        begin = end
+    for triangle in range(len(labels)):
+        labels[triangle] = _root(labels, triangle)
+
+
+@compiled
+def _are_coplanar(corners: Floats, normals: Floats, areas: Floats, one: int, other: int, flat_m: float) -> bool:
+    """Whether all corners of the smaller triangle lie in the plane of the larger one, and neither is without area."""
+    if areas[one] < areas[other]:
+        one, other = other, one
+    turn = 0.0
+    for axis in range(3):
+        turn += normals[one, axis] * normals[other, axis]
+    if not abs(turn) > _SAME_TURN:
+        return False
+    for corner in range(3):
+        height = 0.0
+        for axis in range(3):
+            height += normals[one, axis] * (corners[other, corner, axis] - corners[one, 0, axis])
+        if abs(height) > flat_m:
+            return False
+    return True
+
+
+@compiled
+def _root(labels: Integers, triangle: int) -> int:
+    while labels[triangle] != triangle:
+        labels[triangle] = labels[labels[triangle]]
+        triangle = labels[triangle]
+    return triangle
 
 
 @compiled

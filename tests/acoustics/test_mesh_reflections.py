@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_reflections import MOST_REFLECTIONS, MeshReflectionFinder, MeshWallLosses, patches_of
-from server.acoustics.mesh_tree import MeshTree
+from server.acoustics.mesh_reflections import MOST_REFLECTIONS, MeshReflectionFinder, MeshWallLosses
+from server.acoustics.mesh_tree import MeshTree, patches_of
 from server.acoustics.reflections import ReflectionFinder
 from server.acoustics.transmission import walls_between
 from server.scene.geometry import Geometry, Material, Materials
@@ -155,3 +155,30 @@ def test_transmission_takes_what_the_walls_of_a_plan_take():
     assert 0 < np.count_nonzero(through) < 200
     solid = np.where(np.arange(3)[:, None] == 0, np.inf, -GAINS_DB)
     assert not MeshWallLosses(tree, solid).between(listener, emitters)[0].any()
+
+
+def test_turned_freely_and_in_single_precision_a_mesh_loses_no_reflection():
+    """Walls of several triangles each, which rounding puts into planes that are not quite the same."""
+    fine = MeshGeometry.of_plan(LARGE).mesh
+    for _ in range(3):
+        corners = fine.corners_m
+        halves = (corners + np.roll(corners, -1, axis=1)) / 2
+        inner = [np.stack([corners[:, k], halves[:, k], halves[:, k - 1]], axis=1) for k in range(3)]
+        parts = np.concatenate([*inner, halves])
+        numbers = np.arange(3 * len(parts)).reshape(-1, 3)
+        fine = TriangleMesh(parts.reshape(-1, 3), numbers, np.tile(fine.surfaces, 4), fine.materials)
+    turn, _ = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))
+    moved = (fine.vertices_m @ turn.T + (13, -7, 5)).astype(np.float32)
+    turned = MeshReflectionFinder(
+        MeshTree(TriangleMesh(moved, fine.triangles, fine.surfaces, fine.materials)), GAINS_DB
+    )
+    expected, lost, number = MeshReflectionFinder(MeshTree(fine), GAINS_DB), 0, 0
+    emitters = points_inside(LARGE.floor_plan, 40, 1)
+    for listener in points_inside(LARGE.floor_plan, 40, 2):
+        wanted = expected.find(listener, emitters)
+        found = turned.find(turn @ listener + (13, -7, 5), emitters @ turn.T + (13, -7, 5))
+        counts = [np.bincount(each.emitter, minlength=len(emitters)) for each in (wanted, found)]
+        lost += np.abs(counts[0] - counts[1]).sum()
+        number += len(wanted.emitter)
+    assert number > 2000
+    assert lost < 0.002 * number

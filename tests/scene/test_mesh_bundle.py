@@ -100,7 +100,7 @@ def test_a_plan_as_a_mesh_has_the_responses_of_the_plan(as_plan, as_mesh):
             for listener, emitter in zip(listeners, emitters, strict=True)
         ]
     )
-    assert same.mean() > 0.95
+    assert same.mean() > 0.9
     hidden = ~as_plan.surroundings.is_visible(listeners, emitters)
     assert 5 < hidden.sum() < 35
     for bundle in (as_plan, as_mesh):
@@ -108,7 +108,7 @@ def test_a_plan_as_a_mesh_has_the_responses_of_the_plan(as_plan, as_mesh):
         responses.append(whole.impulse_responses(listeners, emitters, np.linspace(0, 6, len(listeners))))
     expected, found = responses
     error = np.sum((found - expected) ** 2, axis=(1, 2)) / np.sum(expected**2, axis=(1, 2))
-    assert np.all(error[same] < 1e-5)
+    assert np.all(error[same] < 1e-4)
 
 
 def test_a_field_of_directions_is_heard_in_a_mesh_as_in_the_plan(tmp_path):
