@@ -28,7 +28,7 @@ UNHEARD_DB = -100.0
 MOST_BENDS = 16
 """A path with more bends is not drawn taut."""
 _SWEEPS = 20
-_STILL_M = 1e-5
+_STILL_M = 3e-4
 # Where a taut path is blocked, its bends move as far as nothing is in the way, in so many steps.
 _GUARDED_SWEEPS, _SHORTER_STEPS, _GUARDED_STILL_M = 2, 2, 1e-3
 _UNKNOWN, _SEEN, _HIDDEN = 0, 1, 2
@@ -168,7 +168,8 @@ def _way_round(
     """The last point on the shortest way from the listener; -1 if there is none. `to_point` (point,) and `near_of` keep
     lengths from the listener, and the numbers of the first points on these ways; negative lengths are not known yet.
 
-    What is not known to be hidden is taken for seen, and looked at when a way by it is the shortest.
+    What is not known to be hidden is taken for seen, and looked at when a way by it is the shortest. So is the length
+    of the way to a point: until then, it is taken for the straight one.
     """
     cell = _cell(bends, emitter)
     waiting = 0
@@ -176,10 +177,11 @@ def _way_round(
         point = bends.seen[number]
         if not may_bend(bends.places, bends.facings, point, emitter):
             continue
-        if to_point[point] < 0.0:
-            _come_to(bends, point, reached, reach_m, count, to_point, near_of)
-        if to_point[point] < math.inf:
-            waits[waiting], wait_m[waiting] = point, to_point[point] + _distance(emitter, bends.places[point])
+        length = float(to_point[point])
+        if length < 0.0:  # at least as far as straight there
+            length = _distance(listener, bends.places[point])
+        if length < math.inf:
+            waits[waiting], wait_m[waiting] = point, length + _distance(emitter, bends.places[point])
             waiting += 1
     while waiting:
         best = 0
@@ -187,9 +189,11 @@ def _way_round(
             if wait_m[place] < wait_m[best]:
                 best = place
         point = waits[best]
-        near = near_of[point]
-        if not _is_seen(tree, stack, bends, listener, reached[near], sight):
-            reach_m[near] = math.inf
+        is_known = to_point[point] >= 0.0
+        if is_known and not _is_seen(tree, stack, bends, listener, reached[near_of[point]], sight):
+            reach_m[near_of[point]] = math.inf
+            is_known = False
+        if not is_known:
             _come_to(bends, point, reached, reach_m, count, to_point, near_of)
             wait_m[best] = to_point[point] + _distance(emitter, bends.places[point])
             if to_point[point] < math.inf:

@@ -6,6 +6,7 @@ triangles of emitters, of the listener's start and of spawn areas say where thes
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -169,8 +170,12 @@ def level_of(path: Path, source: LevelSource, axes: Axes) -> Level:
     numbers = {name: index for index, name in enumerate(names)}
     notes = list(source.notes)
 
-    def surfaces(owners: set[int]) -> Surfaces:
-        parts = [part for part in source.parts if labelled[part.node].owner in owners]
+    parts_of = defaultdict(list)
+    for part in source.parts:
+        parts_of[labelled[part.node].owner].append(part)
+
+    def surfaces(owner: int) -> Surfaces:
+        parts = parts_of.get(owner, [])
         return _joined(parts, [numbers[_material(part, labelled)] for part in parts], to_world)
 
     silent = {index for index, each in enumerate(labelled) if each.owner == index and each.role is not Role.DOOR}
@@ -181,7 +186,7 @@ def level_of(path: Path, source: LevelSource, axes: Axes) -> Level:
         if each.owner != index:
             continue
         origin = to_world @ each.node.to_file[:3, 3]
-        own = surfaces({index})
+        own = surfaces(index)
         if each.role is Role.DOOR:
             if source.kind == "OBJ":
                 problem = "an OBJ file does not say where the hinge of this door is: export the level as glTF"
@@ -195,7 +200,7 @@ def level_of(path: Path, source: LevelSource, axes: Axes) -> Level:
         else:
             listener = (_point(origin), _heading(each, to_world))
     return Level(
-        surfaces({-1}),
+        surfaces(-1),
         tuple(names),
         tuple(node.name for node in source.nodes),
         tuple(doors),

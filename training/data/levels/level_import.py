@@ -32,6 +32,7 @@ from training.data.levels.level_source import LevelError, LevelSource
 from training.data.levels.materials import Assignment, MaterialMap, table, unassigned_message
 from training.data.levels.mesh_report import MeshReport
 from training.data.levels.obj_file import read_obj
+from training.data.levels.space import OUTSIDE
 from training.data.scene_file import LONGEST_SIDE_M, SHORTEST_SIDE_M, TALLEST_M, Probes, Simulation
 
 _Point = tuple[float, float, float]
@@ -97,6 +98,7 @@ def import_level(path: Path, choices: Choices) -> ImportedLevel:
     missing = [each for each in assignments if each.material is None and each.name in used]
     problems = [*seen.problems, *([unassigned_message(missing)] if missing else [])]
     start, start_notes = _start(level, seen)
+    notes += [] if choices.is_open else _outside(level, seen)
     report = MeshReport(
         path.name,
         _words(axes),
@@ -175,6 +177,23 @@ def _size(path: Path, level: Level) -> tuple[_Point, list[str]]:
     if z < _LIKELY_SMALLEST_M or min(x, y) < _LIKELY_SMALLEST_M:
         notes.append(f"the level is {words}: small for a place; is its unit larger, or another axis up?")
     return (x, y, z), notes
+
+
+def _outside(level: Level, seen: Examination) -> list[str]:
+    """Notes on what stands outside of a level that has closed rooms."""
+    named = [(f"emitter {name}", place) for name, place in level.emitters]
+    named += [(f"spawn area {area.name}", _round(tuple((np.array(area.low) + area.high) / 2))) for area in level.spawns]
+    if level.listener is not None:
+        named.append(("listener_start", level.listener[0]))
+    if not seen.rooms or not named:
+        return []
+    regions = seen.space.regions_at([place for _, place in named])
+    return [
+        f"{name} at ({', '.join(f'{side:.3g}' for side in place)}) is outside of all closed rooms: move it in, or say "
+        "--open if the level has open sky"
+        for (name, place), region in zip(named, regions, strict=True)
+        if region == OUTSIDE
+    ]
 
 
 def _start(level: Level, seen: Examination) -> tuple[Start, list[str]]:

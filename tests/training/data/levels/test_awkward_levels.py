@@ -215,3 +215,16 @@ def test_a_million_triangles_are_served_within_a_minute(tmp_path):
     imported, reason = outcome(path)
     assert not reason
     assert imported.scene.mesh.volume_m3 == pytest.approx(5 * 2.6 * 4, rel=0.01)
+
+
+def test_what_stands_outside_of_a_closed_level_is_told(tmp_path):
+    path = tmp_path / "level.glb"
+    write_glb(path, [room(), empty("emitter_near", (1, 1, 1)), empty("emitter_far", (20, 1, 1))])
+    imported, reason = outcome(path)
+    assert not reason
+    told = [note for note in imported.report.notes if "outside of all closed rooms" in note]
+    assert told == [
+        "emitter far at (20, -1, 1) is outside of all closed rooms: move it in, or say --open if the level has open sky"
+    ]
+    under_the_sky, _ = outcome(path, is_open=True)
+    assert not any("outside of all closed rooms" in note for note in under_the_sky.report.notes)

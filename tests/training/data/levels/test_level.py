@@ -1,5 +1,6 @@
 import importlib.util
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from training.data.levels.axis_options import Handedness, Units, Up
 from training.data.levels.gltf_file import read_gltf
 from training.data.levels.gltf_writer import Piece, WrittenNode
 from training.data.levels.level import GLTF_AXES, Axes, level_of
-from training.data.levels.level_source import LevelError
+from training.data.levels.level_source import LevelError, LevelSource, Node, Part
 
 ROOT = Path(__file__).parents[4]
 PAGE = ROOT / "docs/how-to/bring-your-own-level.md"
@@ -109,3 +110,15 @@ def test_a_property_names_the_material_of_all_below_it(glb):
 def test_names_and_properties_that_cannot_be_meant_are_refused(glb, nodes, complaint):
     with pytest.raises(LevelError, match=complaint):
         read(glb(room(), *nodes))
+
+
+def test_thousands_of_emitters_with_triangles_take_no_longer_each():
+    triangle = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], dtype=float), np.array([(0, 1, 2)])
+    count = 15_000
+    nodes = tuple(Node(f"emitter_{number}", np.eye(4)) for number in range(count))
+    parts = tuple(Part(number, *triangle, "plaster") for number in range(count))
+    begin = time.process_time()
+    level = level_of(Path("level.glb"), LevelSource("glTF", nodes, parts, ()), GLTF_AXES)
+    assert time.process_time() - begin < 2
+    assert len(level.emitters) == count
+    assert len(level.surfaces.triangles) == 0
