@@ -131,8 +131,9 @@ open field has a coarser one."""
 
 
 def open_page(context, url: str):
-    """With coarse maps of loudness."""
+    """With coarse maps of loudness, and without ripples about sources, for which it paints sixty frames a second."""
     page = context.new_page()
+    page.emulate_media(reduced_motion="reduce")
     page.add_init_script(_COARSE_MAPS)
     page.goto(url)
     page.evaluate("nafir.ready")

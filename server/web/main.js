@@ -216,7 +216,8 @@ class Page {
     this.player.addEventListener("report", ({ detail }) => {
       if (!this.playing || this.connection !== "live") return;
       this.steady = detail.playing;
-      this.plan.glow(...this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary(), this.turnLedger.summary()));
+      const lengths = this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary(), this.turnLedger.summary());
+      if (lengths) this.plan.glow(...lengths);
       if (this.output === "ambisonics" && epochNow() - this.turnedAt >= REST_MS) this.#turnHead();
     });
     this.player.addEventListener("turned", ({ detail }) => {

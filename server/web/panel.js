@@ -3,7 +3,8 @@
 import { Sparkline } from "./sparkline.js";
 
 const FLOOR_DB = -60;
-const DRAW_MS = 100; // interval of figures and strip chart; the meters are drawn with every report
+const DRAW_MS = 100; // interval of figures and strip chart
+const METER_MS = 40; // interval of the meters: whatever moves, the browser paints a whole frame, and reports come seventy times a second
 const decibels = (amplitude) => (amplitude > 0 ? 20 * Math.log10(amplitude) : -Infinity);
 const fraction = (level) => Math.min(1, Math.max(0, 1 - level / FLOOR_DB));
 const milliseconds = (value) => `${Math.round(value)} ms`;
@@ -21,11 +22,15 @@ class Meter {
     this.#output = root.querySelector("output");
   }
 
-  /** Rises at once and falls slowly, like a programme meter. Returns the bar's length, 0 to 1. */
-  show(rms, peak) {
+  /** Rises at once and falls slowly, like a programme meter. */
+  hear(rms, peak) {
     const level = Math.max(FLOOR_DB, decibels(rms));
     this.#shown = Math.max(level, this.#shown - 1.2);
     this.#peakHold = Math.max(Math.max(FLOOR_DB, decibels(peak)), this.#peakHold - 0.5);
+  }
+
+  /** Returns the bar's length, 0 to 1. */
+  draw() {
     this.#bar.style.transform = `scaleX(${fraction(this.#shown).toFixed(4)})`;
     this.#peak.style.left = `${(100 * fraction(this.#peakHold)).toFixed(2)}%`;
     return fraction(this.#shown);
@@ -37,7 +42,7 @@ class Meter {
 
   rest() {
     this.#peakHold = this.#shown = FLOOR_DB;
-    this.show(0, 0);
+    this.draw();
     this.print();
   }
 }
@@ -48,6 +53,7 @@ export class Panel {
   #right;
   #spark;
   #drawn = 0;
+  #metersDrawn = 0;
   #dropouts = 0;
   #fillMs = null;
   #turnsHere = false;
@@ -76,7 +82,8 @@ export class Panel {
     this.#find("part-server-name").textContent = isHere ? "This browser" : "Server and network";
   }
 
-  /** Shows a worklet report and the latencies of direct sound, reflected field and turns. Returns the meters' lengths for both ears. */
+  /** Shows a worklet report and the latencies of direct sound, reflected field and turns. Returns the meters' lengths for both ears
+   * where they are drawn anew, else null. */
   report(report, latency, reverberation, turn) {
     const at = performance.now();
     const fillMs = 1000 * report.fillS;
@@ -84,12 +91,15 @@ export class Panel {
     const dropout = report.counters.underruns > this.#dropouts;
     this.#dropouts = report.counters.underruns;
     this.#spark.add({ at, value: fillMs, target: 1000 * report.targetS, dropout });
-    const lengths = [this.#left.show(report.rms[0], report.peak[0]), this.#right.show(report.rms[1], report.peak[1])];
+    this.#left.hear(report.rms[0], report.peak[0]);
+    this.#right.hear(report.rms[1], report.peak[1]);
     if (at - this.#drawn >= DRAW_MS) {
       this.#drawn = at;
       this.#print(report, latency, reverberation, turn);
     }
-    return lengths;
+    if (at - this.#metersDrawn < METER_MS) return null;
+    this.#metersDrawn = at;
+    return [this.#left.draw(), this.#right.draw()];
   }
 
   #print({ targetS, counters, started }, latency, reverberation, turn) {
