@@ -66,7 +66,18 @@ def _compile_responses() -> None:
     ImpulseResponse.compute(field, IrQuery(start.listener, start.emitter))
 
 
-_PARTS = {"simulation": _compile_simulation, "rendering": _compile_rendering, "responses": _compile_responses}
+def _compile_meshes() -> None:
+    from server.acoustics.surroundings import compile_meshes
+
+    compile_meshes()
+
+
+_PARTS = {
+    "simulation": _compile_simulation,
+    "rendering": _compile_rendering,
+    "responses": _compile_responses,
+    "meshes": _compile_meshes,
+}
 
 if __name__ == "__main__":
     sys.path[0] = str(ROOT)

@@ -138,7 +138,8 @@ class MeshTree:
 
 def _pairs(a: Points, b: Points) -> tuple[_Floats, _Floats, tuple[int, ...]]:
     starts, ends = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    flat = [np.array(points.reshape(-1, 3)) for points in (starts, ends)]  # copies: what is broadcast is read-only
+    # Copies: what is broadcast is read-only, and rows follow each other.
+    flat = [np.array(points.reshape(-1, 3), order="C") for points in (starts, ends)]
     return flat[0], flat[1], starts.shape[:-1]
 
 

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan, Points, Vector3
 from server.acoustics.mesh import TriangleMesh
 from server.acoustics.mesh_edges import Bends, bends_of
@@ -144,3 +145,17 @@ class MeshSurroundings:
 
     def first_echo(self) -> FirstEcho:
         return first_echo_of(self._mirrors)
+
+
+def compile_meshes() -> None:
+    """Compile the code by which meshes are asked, or load it from disk: a quarter of a minute where it is not there."""
+    corners = np.array([(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+    sheet = TriangleMesh(corners, np.arange(3, dtype=np.int32)[None], np.zeros(1, np.int32), ("sheet",))
+    here, there = np.array([-1.0, 0.2, 0.2]), np.array([[1.0, 0.2, 0.2]])
+    surroundings = MeshSurroundings(sheet)
+    surroundings.holds((-1.0, 0.2, 0.2))
+    surroundings.is_visible(here, there)
+    surroundings.sound_paths(343.0).find(here, there)
+    silent = np.zeros((1, len(OCTAVE_BANDS_HZ)))
+    surroundings.first_reflections(silent, silent).find(here, there)
+    surroundings.first_echo()

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings
+from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings, compile_meshes
+from server.kernels.compiled import functions_compiled
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.scene_file import SceneFile
 
@@ -81,3 +82,16 @@ def test_under_the_open_sky_what_no_back_shows_is_air():
     assert MeshSurroundings(floor, open_sky=True).contains(above)
     assert not MeshSurroundings(floor, open_sky=True).contains(below)
     assert not MeshSurroundings(floor).contains(above)
+
+
+def test_once_compiled_a_mesh_is_asked_without_compiling(mesh, points):
+    compile_meshes()
+    before = functions_compiled()
+    inside = points[mesh.contains(points)]
+    place = MeshSurroundings(mesh.mesh)
+    assert place.holds(tuple(inside[0]))
+    place.is_visible(inside[0], inside)
+    place.sound_paths(343.0).find(inside[0], inside)
+    place.first_reflections(GAINS_DB, LOSSES_DB).find(inside[0], inside)
+    place.first_echo().length_m(inside[:1], inside[1:2])
+    assert functions_compiled() == before
