@@ -24,6 +24,9 @@ LOOK_S: Final = 1.0
 """Seconds between two looks at the files, and at the callers of open streams."""
 Ending = Literal["key_expired", "key_revoked"]
 """Why a caller may not go on."""
+OwnScope = Literal["process"]
+OWN_SCOPE: Final[OwnScope] = "process"
+"""What the processes of a server may do with each other, and no key or token can say."""
 _SHOWN_SUBJECT = 64
 """Characters of a token's subject that logs show."""
 
@@ -44,13 +47,18 @@ class Caller:
 
     name: str
     """For logs and limits: `key ID` or `token SUBJECT`."""
-    scopes: frozenset[Scope]
+    scopes: frozenset[Scope | OwnScope]
     expires_s: float | None
     """When the key or token ends, in seconds since 1970."""
     proof: ApiKey | TokenKey | None
     """What admitted the caller, as it was read from its file; None for the server's own processes."""
     subject: str | None = None
     """Of a token, whole: what tells its bearers apart. None for a key."""
+
+    @property
+    def is_own_process(self) -> bool:
+        """Whether it is another process of this server."""
+        return OWN_SCOPE in self.scopes
 
     @property
     def identity(self) -> str:
@@ -146,7 +154,7 @@ class Access:
 
     def _admit_key(self, key: str) -> Caller:
         if self._own is not None and hmac.compare_digest(digest(key), self._own):
-            return Caller("own process", frozenset({"metrics", "admin"}), None, None)
+            return Caller("own process", frozenset({"metrics", OWN_SCOPE}), None, None)
         entry = self._keys.find(key)
         if entry is None:
             raise AccessError("key_refused", "there is no such key: it may have been revoked")

@@ -1,8 +1,9 @@
 """The gate that asks every request and every WebSocket handshake for a key.
 
 It refuses by default: a path that is not listed here needs the scope `admin`, so that a new route is closed until
-somebody decides who may use it. Open to all are the health checks and the files of the page, which are the same on
-every server: those of /docs and /redoc too, which fetch the description of the interface with the key of their tab.
+somebody decides who may use it. One path is for the server's own processes alone. Open to all are the health checks and
+the files of the page, which are the same on every server: those of /docs and /redoc too, which fetch the description of
+the interface with the key of their tab.
 
 A key comes in `Authorization: Bearer KEY`. A browser's `WebSocket` cannot set headers, so there it may come among the
 subprotocols, as `nafir.key.` and the key in base64url. It is never taken from the query, which servers and proxies log.
@@ -20,7 +21,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from server.api import api_keys
-from server.api.access import Access, AccessError, Caller
+from server.api.access import OWN_SCOPE, Access, AccessError, Caller, OwnScope
 from server.api.api_keys import SCOPES
 from server.api.connection_limits import HEALTH_PATHS
 from server.api.problems import Refusal, refuse
@@ -37,11 +38,11 @@ class Rule:
     """Paths that match `path`, with one of the `methods` if there are any, need one of the `scopes`."""
 
     path: re.Pattern[str]
-    scopes: frozenset[api_keys.Scope]
+    scopes: frozenset[api_keys.Scope | OwnScope]
     methods: frozenset[str] | None = None
 
 
-def _rule(path: str, *scopes: api_keys.Scope, methods: frozenset[str] | None = None) -> Rule:
+def _rule(path: str, *scopes: api_keys.Scope | OwnScope, methods: frozenset[str] | None = None) -> Rule:
     return Rule(re.compile(path), frozenset(scopes), methods)
 
 
@@ -55,11 +56,12 @@ RULES: Final = (
     _rule(r"/v1/stream(/.*)?", "listen"),
     _rule(r"/(openapi|asyncapi)\.json|/v1/schemas(/.*)?", "listen", "render", "upload", "admin", methods=_READ),
     _rule(r"/metrics(/process)?", "metrics", "admin", methods=_READ),
+    _rule(r"/streams/process", OWN_SCOPE),
 )
 """The first rule that matches decides; where none does, the scope is `admin`."""
 
 
-def scopes_for(method: str, path: str) -> frozenset[api_keys.Scope]:
+def scopes_for(method: str, path: str) -> frozenset[api_keys.Scope | OwnScope]:
     """The scopes of which a request needs one. A WebSocket handshake is a GET."""
     for rule in RULES:
         if rule.path.fullmatch(path) and (rule.methods is None or method in rule.methods):
@@ -117,6 +119,9 @@ class AccessGate:
         needed = scopes_for(method, path)
         if caller.scopes & needed:
             return caller
+        if OWN_SCOPE in needed:
+            own = "this is for the server's own processes alone"
+            return Refusal(403, "scope_missing", own, _challenge('error="insufficient_scope"'))
         wanted = " or ".join(scope for scope in SCOPES if scope in needed)
         challenge = _challenge(f'error="insufficient_scope", scope="{next(each for each in SCOPES if each in needed)}"')
         return Refusal(403, "scope_missing", f"this needs a key with the scope {wanted}", challenge)

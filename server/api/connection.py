@@ -41,7 +41,7 @@ from server.api.catalogue import describe_scene
 from server.api.inflow import LISTENER_COST, Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
-from server.api.process_peers import MovedStream, ProcessPeers
+from server.api.process_peers import AskedStream, MovedStream, ProcessPeers, ToldStream, random_token
 from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
 from server.api.settings import Settings, usable_cores
@@ -292,6 +292,8 @@ class StreamHost:
     """The clock that hosts share, in seconds since 1970."""
     openings: OneAtATime = dataclasses.field(default_factory=OneAtATime)
     """Creates sessions one after the other, since each takes about 8 ms of CPU time."""
+    settling: set[asyncio.Task[None]] = dataclasses.field(default_factory=set)
+    """Tasks that tell other processes what became of their streams."""
     silent: dict[asyncio.Timeout, None] = dataclasses.field(default_factory=dict)
     """Timeouts of the connections that have not sent a hello, oldest first."""
 
@@ -310,7 +312,10 @@ class StreamHost:
             else Seal(secret.get_secret_value().encode(), lifetime_s=self.settings.snapshot_lifetime_s)
         )
         self.kept = KeptStreams(
-            keep_s=self.settings.resume_s, most=self.settings.max_streams, give_up=self.admission.leave
+            keep_s=self.settings.resume_s,
+            most=self.settings.max_streams,
+            give_up=self.admission.leave,
+            new_token=random_token if self.peers is None else self.peers.new_token,
         )
 
     @property
@@ -354,17 +359,27 @@ class StreamHost:
         kept = await self.kept.take(token, owner=owner)
         if kept is not None or self.peers is None:
             return kept
-        moved = await asyncio.to_thread(self.peers.take, token, owner)
+        moved_to = self.kept.moved_to(token)
+        number = self.peers.home_of(token) if moved_to is None else moved_to
+        moved = await self.peers.take(token, owner, number)
         return None if moved is None else KeptStream.moved(moved, token, owner)
 
-    async def give_kept(self, token: str, *, owner: str | None) -> MovedStream | None:
-        """The stream of a token for another process; it has no place here any more."""
-        kept = await self.kept.take(token, owner=owner)
-        if kept is None:
-            return None
-        if kept.place is not None:
-            self.admission.leave(kept.place)
-        return MovedStream(kept.data, kept.plays_s, kept.until_s)
+    async def lend_kept(self, asked: AskedStream) -> ToldStream:
+        """The stream of a token for another process. It is still kept here until that process says what became of
+        it."""
+        kept = await self.kept.lend(asked.token, owner=asked.owner)
+        if kept is None or self.peers is None:
+            return ToldStream(moved_to=self.kept.moved_to(asked.token))
+        return ToldStream(stream=MovedStream(kept.data.decode(), kept.plays_s, kept.until_s, self.peers.number))
+
+    def settle(self, kept: KeptStream, *, is_resumed: bool) -> None:
+        """Say what became of a stream that was taken, where it was kept."""
+        if kept.lender is not None and self.peers is not None:
+            telling = asyncio.create_task(self.peers.settle(kept.lender, kept.tokens[0], is_resumed=is_resumed))
+            self.settling.add(telling)
+            telling.add_done_callback(self.settling.discard)
+        elif not is_resumed:
+            self.kept.put_back(kept)
 
     def take(self, scene: "MeasuredScene") -> None:
         """Offer a scene from now on, in place of any other with its id. Streams that are open keep theirs."""
@@ -545,7 +560,7 @@ class Connection:
             return await self._serve_stream(lost.snapshot.hello, lost)
         finally:
             if not self._has_resumed:
-                host.kept.put_back(lost.kept)
+                host.settle(lost.kept, is_resumed=False)
 
     async def _serve_stream(self, hello: Hello, lost: _LostStream | None) -> Goodbye | None:
         host = self._host
@@ -572,6 +587,8 @@ class Connection:
                 return stream
             place.listeners = len(stream.audience.members)
             host.admission.open(place, stream)
+            if lost is not None:
+                host.settle(lost.kept, is_resumed=True)
             return await self._pump(stream, hello, place)
         finally:
             if self._token is not None:

@@ -123,9 +123,9 @@ def address_of(scope: Scope) -> str | None:
 
 
 def key_of(scope: Scope) -> str | None:
-    """The actor by its key or token; None without one."""
+    """The actor by its key or token; None without one, and for this server's own processes."""
     caller = caller_of(scope)
-    return None if caller is None else caller.name
+    return None if caller is None or caller.is_own_process else caller.name
 
 
 class RateGate:

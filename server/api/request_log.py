@@ -112,7 +112,7 @@ class RequestLog:
         finally:
             if status is not None:
                 self._refused.note(status, code)
-            if status != 101 and not (scope["path"] in _QUIET and status == 200):
+            if status != 101 and not (scope["path"] in _QUIET and status in {200, 204}):
                 _logger.info(
                     "request",
                     extra={

@@ -11,7 +11,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, WebSocket
 from fastapi.responses import JSONResponse, StreamingResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
@@ -23,7 +23,7 @@ from server.api.bundle_files import BundleFiles
 from server.api.catalogue import describe_encodings, describe_scene, playable_clips
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
-from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY
+from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, AskedStream, SettledStream, merged
 from server.api.ranged_files import RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
@@ -155,7 +155,7 @@ async def metrics(request: Request) -> Response:
     host = _host(request)
     body = await anyio.to_thread.run_sync(exposition, ServerCollector(host))
     if host.peers is not None:
-        body = await anyio.to_thread.run_sync(host.peers.gather, body)
+        body = await anyio.to_thread.run_sync(merged, await host.peers.gather(body))
     return Response(body, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
@@ -168,19 +168,26 @@ async def own_metrics(request: Request) -> Response:
 
 @health.post(OWN_STREAMS, include_in_schema=False)
 async def own_stream(request: Request) -> Response:
-    """A stream that this process has kept, for another process of the same server; 204 if it has none of this token.
-    Anybody else is told that there is nothing here."""
-    host = _host(request)
-    if host.peers is None or not host.peers.is_peer(request.headers.get(PEER_KEY)):
+    """A stream that this process has kept, for another process of the same server."""
+    asked = AskedStream.model_validate_json(await _of_peer(request))
+    told = await _host(request).lend_kept(asked)
+    return Response(told.model_dump_json(), media_type="application/json")
+
+
+@health.put(OWN_STREAMS, status_code=204, include_in_schema=False)
+async def settled_stream(request: Request) -> Response:
+    """Another process says whether a stream that it was given goes on there."""
+    told = SettledStream.model_validate_json(await _of_peer(request))
+    _host(request).kept.settle(told.token, by=told.by, is_resumed=told.is_resumed)
+    return Response(status_code=204)
+
+
+async def _of_peer(request: Request) -> bytes:
+    """The body of a request by another process. Anybody else is told that there is nothing here."""
+    peers = _host(request).peers
+    if peers is None or not peers.is_peer(request.headers.get(PEER_KEY)):
         raise HTTPException(404, "Not Found")
-    asked = _AskedStream.model_validate_json(await request.body())
-    moved = await host.give_kept(asked.token, owner=asked.owner)
-    return Response(status_code=204) if moved is None else Response(moved.serialize(), media_type="application/json")
-
-
-class _AskedStream(BaseModel):
-    token: str
-    owner: str | None
+    return await request.body()
 
 
 @documents.get("/asyncapi.json")

@@ -161,7 +161,7 @@ def test_a_key_in_the_query_opens_nothing(client, keys):
         ("GET", "/metrics", {"metrics", "admin"}),
         ("GET", OWN_METRICS, {"metrics", "admin"}),
         ("POST", "/metrics", {"admin"}),
-        ("POST", OWN_STREAMS, {"admin"}),
+        ("POST", OWN_STREAMS, {"process"}),
         ("GET", "/anything/new", {"admin"}),
         ("POST", "/v1/scenes", {"admin"}),
         ("DELETE", "/v1/scenes/flat", {"admin"}),
@@ -374,11 +374,20 @@ def test_the_document_says_what_needs_a_key(client, keys):
 def test_the_processes_of_a_server_ask_each_other_with_a_key_of_their_own(client, keys):
     assert client.get(OWN_METRICS, headers=bearer(PEERS_KEY)).status_code == 200
     check_refused(client.get("/v1/scenes", headers=bearer(PEERS_KEY)), 403, "scope_missing")
-    asked = {"token": "of-nobody", "owner": None}
+    asked = {"token": "of-nobody", "owner": None, "by": 1}
     of_peer = bearer(PEERS_KEY) | {PEER_KEY: PEERS_KEY}
-    assert client.post(OWN_STREAMS, headers=of_peer, json=asked).status_code == 204
-    for other in (bearer(keys["admin"]), bearer(keys["admin"]) | {PEER_KEY: keys["admin"]}):
-        assert client.post(OWN_STREAMS, headers=other, json=asked).status_code == 404
+    assert client.post(OWN_STREAMS, headers=of_peer, json=asked).json() == {"stream": None, "moved_to": None}
+    for key in (*keys.values(), token(scope="process")):
+        check_refused(client.post(OWN_STREAMS, headers=bearer(key) | {PEER_KEY: key}, json=asked), 403, "scope_missing")
+    check_refused(client.get("/anything/new", headers=bearer(PEERS_KEY)), 403, "scope_missing")
+
+
+def test_the_processes_of_a_server_do_not_wait_for_each_other(client):
+    """They share one key, and ask for as many streams as clients come back to the wrong one."""
+    told = {"token": "of-nobody", "by": 1, "is_resumed": True}
+    of_peer = bearer(PEERS_KEY) | {PEER_KEY: PEERS_KEY}
+    most = client.app_state["host"].settings.requests_per_min
+    assert {client.put(OWN_STREAMS, headers=of_peer, json=told).status_code for _ in range(most + 1)} == {204}
     assert PEERS_KEY not in repr(ProcessPeers(0, (1,), PEERS_KEY))
 
 

@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from server.api import kept_streams
 from server.api.kept_streams import KeptStream, KeptStreams
 
 
@@ -143,3 +144,54 @@ def test_the_former_token_is_good_until_the_client_has_shown_that_it_has_the_new
         return None if found is None else (found.data, await streams.take(second))
 
     assert running(scenario) == (None if is_confirmed else (b"later", None))
+
+
+def test_a_place_is_held_until_the_stream_goes_on_elsewhere():
+    async def scenario():
+        streams, given_up = keeping(keep_s=5.0)
+        token = streams.open(lambda: None)
+        streams.close(token, KeptStream(b"state", 1.0, place := object()))
+        assert await streams.lend(token, owner="another") is None
+        assert (await streams.lend(token, owner=None)).data == b"state"
+        assert given_up == []
+        assert await streams.take(token) is None  # one at a time
+        streams.settle(token, by=2, is_resumed=False)
+        assert (await streams.lend(token, owner=None)).place is place
+        assert streams.moved_to(token) is None
+        streams.settle(token, by=2, is_resumed=True)
+        streams.settle(token, by=2, is_resumed=True)  # a second call changes nothing
+        assert streams.moved_to(token) == 2
+        return given_up == [place], await streams.take(token), len(streams)
+
+    assert running(scenario) == (True, None, 0)
+
+
+@pytest.mark.parametrize("is_told_late", [True, False])
+def test_a_stream_of_which_nothing_more_is_heard_is_kept_again(monkeypatch, is_told_late):
+    monkeypatch.setattr(kept_streams, "_LENT_S", 0.02)
+
+    async def scenario():
+        streams, given_up = keeping(keep_s=5.0)
+        token = streams.open(lambda: None)
+        streams.close(token, KeptStream(b"state", 1.0, place := object()))
+        await streams.lend(token, owner=None)
+        await asyncio.sleep(0.1)
+        assert (len(streams), given_up) == (1, [])
+        if is_told_late:
+            streams.settle(token, by=1, is_resumed=True)
+        return await streams.take(token) is None, given_up == [place]
+
+    assert running(scenario) == (is_told_late, is_told_late)
+
+
+def test_a_stream_that_comes_back_is_where_it_is():
+    async def scenario():
+        streams, _ = keeping(keep_s=5.0)
+        token = streams.open(lambda: None)
+        streams.close(token, KeptStream(b"state", 1.0))
+        await streams.lend(token, owner=None)
+        streams.settle(token, by=1, is_resumed=True)
+        streams.open(lambda: None, former=token)
+        return streams.moved_to(token)
+
+    assert running(scenario) is None

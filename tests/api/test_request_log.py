@@ -25,6 +25,9 @@ def client(counted):
     async def refused(_):
         return problem(409, "map_too_fine", "no")
 
+    async def silent(_):
+        return Response(status_code=204)
+
     async def failing(_):
         raise ValueError("a fault")
 
@@ -44,6 +47,7 @@ def client(counted):
         Route("/v1/good", good),
         Route("/livez", good),
         Route("/metrics", refused),
+        Route("/streams/process", silent, methods=["PUT"]),
         Route("/v1/refused", refused),
         Route("/v1/failing", failing),
         Route("/v1/bare", bare),
@@ -86,8 +90,9 @@ def test_every_request_has_a_line_without_its_query(client, logged):
     assert logged()[0][2:4] == (500, "internal_error")
 
 
-def test_health_checks_have_lines_only_if_they_fail(client, logged):
+def test_what_is_asked_all_the_time_has_lines_only_if_it_fails(client, logged):
     client.get("/livez")
+    assert client.put("/streams/process").status_code == 204
     assert logged() == []
     client.get("/metrics")
     assert [line[:4] for line in logged()] == [("GET", "/metrics", 409, "map_too_fine")]

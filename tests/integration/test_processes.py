@@ -1,5 +1,6 @@
 """Servers that take their connections from another process; and a whole `nafir serve --processes`."""
 
+import asyncio
 import contextlib
 import json
 import os
@@ -206,3 +207,29 @@ def test_streams_are_spread_over_processes_one_that_dies_takes_only_its_own_and_
                 assert server.wait(20) == 0
         finally:
             server.kill()
+
+
+async def durations_of_asking(ports):
+    """How long process 0 waits for a stream of process 1; how long 60 of its clients wait together; and how long other
+    work waits meanwhile."""
+    one, other = (ProcessPeers(number, ports, "a key") for number in range(2))
+
+    async def duration(work):
+        began_s = time.monotonic()
+        await work
+        return time.monotonic() - began_s
+
+    async def take():
+        assert await one.take(other.new_token(), None, 1) is None
+
+    alone = await duration(take())
+    in_thread = asyncio.to_thread(time.sleep, 0.01)
+    return alone, *await asyncio.gather(duration(asyncio.gather(*(take() for _ in range(60)))), duration(in_thread))
+
+
+def test_who_waits_for_a_process_that_is_being_started_keeps_nobody_else_waiting():
+    """Its socket accepts connections before anybody answers."""
+    with listening_privately() as starting:
+        alone, together, in_thread = asyncio.run(durations_of_asking((0, starting.getsockname()[1])))
+    assert together < 2 * alone
+    assert in_thread < alone / 2

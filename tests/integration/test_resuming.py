@@ -404,15 +404,19 @@ def two_processes(bundle, hrtfs):
 
 
 def asked_for(address, token, key=None):
-    """The status with which a process answers whoever asks it for a stream."""
-    body = json.dumps({"token": token, "owner": None}).encode()
+    """The status and the answer of a process to whoever asks it for a stream."""
+    return peer_request(address, "POST", {"token": token, "owner": None, "by": 1}, key)
+
+
+def peer_request(address, method, told, key):
     headers = {"Content-Type": "application/json", **({} if key is None else {PEER_KEY: key})}
-    request = urllib.request.Request(f"http://{address}{OWN_STREAMS}", body, headers)
+    url = f"http://{address}{OWN_STREAMS}"
+    request = urllib.request.Request(url, json.dumps(told).encode(), headers, method=method)
     try:
         with urllib.request.urlopen(request, timeout=5) as answer:
-            return answer.status
+            return answer.status, json.loads(answer.read() or "null")
     except urllib.error.HTTPError as answer:
-        return answer.code
+        return answer.code, None
 
 
 @pytest.mark.parametrize("is_broken", [True, False], ids=["lost", "half open"])
@@ -423,7 +427,8 @@ def test_a_token_of_one_process_resumes_at_another(bundle, hrtfs, expected, is_b
         if is_broken:
             before.drop()
         # Nobody else gets it, whatever they know.
-        assert {asked_for(one, before.first.resume_token, key) for key in (None, "", "another key")} == {404}
+        for key in (None, "", "another key"):
+            assert asked_for(one, before.first.resume_token, key) == (404, None)
         with listening(other, before.resumption()) as again:
             resumed = again.first.resumed
             assert again.first.session == before.first.session
@@ -444,11 +449,41 @@ def test_a_token_of_one_process_resumes_at_another(bundle, hrtfs, expected, is_b
 def test_a_token_that_no_process_knows_is_told_at_once(bundle, hrtfs):
     with two_processes(bundle, hrtfs) as (one, other):
         began_s = time.monotonic()
-        with listening(one, Resume(protocol=PROTOCOL, token="of-nobody")) as stranger:
-            assert stranger.first.code == "unknown_resume_token"
-            assert stranger.to_the_end().code == 1008
+        for token in ("of-nobody", "1.of.nobody", ProcessPeers(1, (0, 0), KEY).new_token(), "é.é"):
+            with listening(one, Resume(protocol=PROTOCOL, token=token)) as stranger:
+                assert stranger.first.code == "unknown_resume_token"
+                assert stranger.to_the_end().code == 1008
         assert time.monotonic() - began_s < 2
-        assert asked_for(other, "of-nobody", KEY) == 204
+        assert asked_for(other, "of-nobody", KEY) == (200, {"stream": None, "moved_to": None})
+
+
+def test_a_stream_that_cannot_go_on_at_another_process_is_still_where_it_was(bundle, hrtfs, expected):
+    with two_processes(bundle, hrtfs) as (one, other), listening(one) as before:
+        since = begin(before)
+        before.hear(RATE // 4)
+        before.drop()
+        token = before.first.resume_token
+        assert asked_for(one, token, KEY)[1]["stream"] is not None
+        assert asked_for(one, token, KEY)[1]["stream"] is None  # nobody else has it meanwhile
+        told = {"token": token, "by": 1, "is_resumed": False}
+        assert peer_request(one, "PUT", told, "another key") == (404, None)
+        assert peer_request(one, "PUT", told, KEY) == (204, None)
+        with listening(other, before.resumption()) as again:
+            again.hear(SETTLED + RATE // 4)
+        assert error_db(after(again.blocks, SETTLED), expected, since) < -80
+
+
+def test_a_former_token_leads_to_the_process_to_which_its_stream_has_gone(bundle, hrtfs):
+    """A client whose connection breaks before the `welcome` knows no other token."""
+    with two_processes(bundle, hrtfs) as (one, other), listening(one) as before:
+        begin(before)
+        before.hear(RATE // 4)
+        before.drop()
+        with listening(other, before.resumption()) as unheard:
+            unheard.drop()
+        with listening(one, before.resumption()) as again:
+            assert again.first.session == before.first.session
+            again.hear(SETTLED)
 
 
 def streams_of(address):
