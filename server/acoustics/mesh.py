@@ -6,8 +6,7 @@ sides of a triangle stop and reflect sound; orientation matters only to what is 
 """
 
 import io
-import zipfile
-import zlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FARTHEST_M
-from server.core.npy import NpyError, NpyHeader
+from server.core.npy import NpyHeader
+from server.core.npz import NpzArchive, NpzError
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int32]
@@ -141,14 +141,17 @@ class TriangleMesh:
     @classmethod
     def _read(cls, file: IO[bytes], most_triangles: int, most_vertices: int) -> "TriangleMesh":
         try:
-            with zipfile.ZipFile(file) as archive:
-                vertices = _read(archive, "vertices_m", most_vertices, np.dtype(np.float64))
-                triangles = _read(archive, "triangles", most_triangles, np.dtype(np.int32))
-                surfaces = _read(archive, "surfaces", most_triangles, np.dtype(np.int32))
-                names = _read(archive, "materials", MOST_MATERIALS, np.dtype(f"U{LONGEST_NAME}"))
-        # What `zipfile` raises for files that are no archives, damaged, encrypted, or packed in another way.
-        except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as exc:
-            raise MeshError(f"is no readable .npz file: {exc}") from exc
+            archive = NpzArchive(file, _FIELDS)
+            vertices = _read(archive, "vertices_m", most_vertices, np.dtype(np.float64))
+            triangles = _read(archive, "triangles", most_triangles, np.dtype(np.int32))
+            surfaces = _read(archive, "surfaces", most_triangles, np.dtype(np.int32))
+            names = _read(archive, "materials", MOST_MATERIALS, np.dtype(f"U{LONGEST_NAME}"))
+        except NpzError as exc:
+            raise MeshError(f"{exc}: write the file with TriangleMesh.save") from exc
+        codes = np.frombuffer(names.tobytes(), np.dtype(np.uint32).newbyteorder(names.dtype.byteorder))
+        # NumPy makes text of such numbers with a SystemError.
+        if np.any(codes > sys.maxunicode):
+            raise MeshError(f"materials: holds no text: {codes.max()} is no character")
         return cls(vertices, triangles, surfaces, tuple(names.tolist()))
 
 
@@ -214,21 +217,16 @@ def _names(given: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _read(archive: zipfile.ZipFile, name: str, most_rows: int, kind: "np.dtype[Any]") -> npt.NDArray[Any]:
+def _read(archive: NpzArchive, name: str, most_rows: int, kind: "np.dtype[Any]") -> npt.NDArray[Any]:
     """An array of an archive, of the given type or, for text, one that is not wider."""
-    member = f"{name}.npy"
-    if member not in archive.namelist():
-        raise MeshError(f"{name}: is missing: write the file with TriangleMesh.save")
-    with archive.open(member) as stream:
-        try:
-            header = NpyHeader.read(stream)
-            fits = header.dtype.kind == kind.kind and header.dtype.itemsize <= kind.itemsize
-            if not fits or (kind.kind != "U" and header.dtype != kind):
-                raise MeshError(f"{name}: holds {header.dtype}, and must hold {kind}")
-            if header.shape and header.shape[0] > most_rows:
-                raise MeshError(f"{name}: has {header.shape[0]:,} rows, and may have {most_rows:,}: simplify the mesh")
-            if header.data_bytes > most_rows * kind.itemsize * 3:
-                raise MeshError(f"{name}: must be an array of at most three columns, not {header.shape}")
-            return header.array(stream.read(header.data_bytes))
-        except NpyError as exc:
-            raise MeshError(f"{name}: {exc}") from exc
+
+    def require(header: NpyHeader) -> None:
+        fits = header.dtype.kind == kind.kind and header.dtype.itemsize <= kind.itemsize
+        if not fits or (kind.kind != "U" and header.dtype != kind):
+            raise MeshError(f"{name}: holds {header.dtype}, and must hold {kind}")
+        if header.shape and header.shape[0] > most_rows:
+            raise MeshError(f"{name}: has {header.shape[0]:,} rows, and may have {most_rows:,}: simplify the mesh")
+        if header.data_bytes > most_rows * kind.itemsize * 3:
+            raise MeshError(f"{name}: must be an array of at most three columns, not {header.shape}")
+
+    return archive.read(name, require)

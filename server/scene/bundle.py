@@ -9,8 +9,6 @@ import hashlib
 import io
 import json
 import stat
-import zipfile
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +23,8 @@ from server.acoustics.mesh import MeshError, TriangleMesh
 from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings, Surroundings
 from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
-from server.core.npy import MOST_HEADER_BYTES, NpyError, NpyHeader
+from server.core.npy import MOST_HEADER_BYTES, NpyHeader
+from server.core.npz import NpzArchive, NpzError
 from server.scene.geometry import Material
 from server.scene.manifest import ARRAYS_FILE, Manifest, SceneMesh
 from server.scene.signatures import MOST_SIGNATURE_BYTES, SIGNATURE_FILE, BundleKeys
@@ -41,12 +40,8 @@ messages."""
 MOST_TRIANGLES = 200_000
 """The most triangles of a mesh. Paths are looked for in it whenever something moves."""
 _CHUNK_BYTES = 2**20
-_NOISE_MEMBER = "frozen_noise.npy"
 _WIDEST_SAMPLE_BYTES = 8
 _ARCHIVE_OVERHEAD_BYTES = 2**16
-# Exceptions of `zipfile` for invalid or damaged archives. NotImplementedError is a RuntimeError.
-# guard: an archive that is none is refused by file and field
-_ARCHIVE_ERRORS = (OSError, EOFError, KeyError, ValueError, RuntimeError, zlib.error, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
@@ -245,52 +240,21 @@ def _hash_of(stream: IO[bytes], most_bytes: int) -> str:
 
 
 def _frozen_noise(path: Path, data: bytes, samples: int) -> npt.NDArray[np.float32]:
-    """(2, samples) noise from the archive. The archive's directory and the array's header are compared with the
-    manifest before anything is unpacked."""
+    """(2, samples) noise from the archive. The array's header is compared with the manifest before it is unpacked."""
+
+    def require(header: NpyHeader) -> None:
+        if not np.issubdtype(header.dtype, np.floating):
+            raise BundleError(path, "frozen_noise", f"holds {header.dtype}, expected floating point")
+        if header.shape != (2, samples):
+            raise BundleError(path, "frozen_noise", f"has shape {header.shape}, expected {(2, samples)}")
+
     try:
-        with (
-            zipfile.ZipFile(io.BytesIO(data)) as archive,
-            archive.open(_noise_member(path, archive, samples)) as member,
-        ):
-            header = NpyHeader.read(member)
-            _require_noise(path, header, samples)
-            # One byte more, so that `zipfile` sees the end and compares the checksum.
-            stored = header.array(member.read(header.data_bytes + 1))
-    except (NpyError, *_ARCHIVE_ERRORS) as exc:
-        raise BundleError(path, "frozen_noise", f"cannot be read: {exc}") from exc
+        stored = NpzArchive(io.BytesIO(data), ("frozen_noise",)).read("frozen_noise", require)
+    except NpzError as exc:
+        raise BundleError(path, "frozen_noise", f"cannot be read: {exc.problem}") from exc
     with np.errstate(over="ignore"):  # checked below
         noise = stored.astype(np.float32)
     # guard: the frozen noise is finite
     if not np.isfinite(noise).all():
         raise BundleError(path, "frozen_noise", "holds non-finite samples")
     return noise
-
-
-def _noise_member(path: Path, archive: zipfile.ZipFile, samples: int) -> zipfile.ZipInfo:
-    """The archive's only member. Raises BundleError if it has another name, if there are several, or if it unpacks to
-    more than the manifest allows."""
-    members = archive.infolist()
-    names = [member.filename for member in members]
-    if _NOISE_MEMBER not in names:
-        raise BundleError(path, "frozen_noise", "cannot be read: there is no such array in the archive")
-    # guard: an archive of arrays has one member
-    if len(names) > 1:
-        others = [name for name in names if name != _NOISE_MEMBER]
-        problem = f"there are others beside it, {others[0]!r} for one" if others else "it is there twice"
-        raise BundleError(path, "frozen_noise", problem)
-    # guard: an archive unpacks to no more than the manifest allows
-    if members[0].file_size > _noise_bytes(samples):
-        raise BundleError(
-            path,
-            "frozen_noise",
-            f"unpacks to {members[0].file_size} bytes, and {samples} samples by the manifest need at most "
-            f"{_noise_bytes(samples)}",
-        )
-    return members[0]
-
-
-def _require_noise(path: Path, header: NpyHeader, samples: int) -> None:
-    if not np.issubdtype(header.dtype, np.floating):
-        raise BundleError(path, "frozen_noise", f"holds {header.dtype}, expected floating point")
-    if header.shape != (2, samples):
-        raise BundleError(path, "frozen_noise", f"has shape {header.shape}, expected {(2, samples)}")

@@ -1,6 +1,7 @@
 """Triangle meshes against solids of known area and volume; bad arrays and files are refused by name."""
 
 import io
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -169,5 +170,54 @@ def test_limits_hold_before_memory_is_taken(tmp_path):
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (2_000_000, 60_000)})
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
         archive.writestr("vertices_m.npy", header.getvalue())
+        for name in ("triangles", "surfaces", "materials"):
+            archive.writestr(f"{name}.npy", b"")
     with pytest.raises(MeshError, match="at most three columns"):
         TriangleMesh.load(tmp_path / "bomb.npz")
+
+
+def test_archives_of_other_methods_and_with_more_in_them_are_refused_before_memory_is_taken():
+    with zipfile.ZipFile(io.BytesIO(box().to_bytes())) as whole:
+        files = {name: whole.read(name) for name in whole.namelist()}
+    bomb = io.BytesIO()
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_BZIP2) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content + bytes(100_000_000 if name == "vertices_m.npy" else 0))
+    assert len(bomb.getvalue()) < 10_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(MeshError, match="vertices_m: is packed by a method"):
+            TriangleMesh.from_bytes(bomb.getvalue())
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+    more = io.BytesIO(box().to_bytes())
+    with zipfile.ZipFile(more, "a") as archive:
+        archive.writestr("more.npy", b"")
+    with pytest.raises(MeshError, match=r"others beside it, 'more\.npy'"):
+        TriangleMesh.from_bytes(more.getvalue())
+
+
+def test_a_damaged_archive_is_the_same_mesh_or_a_mesh_error():
+    mesh = box()
+    whole, rng = mesh.to_bytes(), np.random.default_rng(5)
+    refused = 0
+    for _ in range(2_000):
+        data = bytearray(whole)
+        for at in rng.integers(len(whole), size=rng.integers(1, 4)):
+            data[at] ^= rng.integers(1, 256)
+        try:
+            read = TriangleMesh.from_bytes(bytes(data))
+        except MeshError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(read.corners_m, mesh.corners_m)
+            assert read.materials == mesh.materials
+    assert refused > 1_000
+
+
+@pytest.mark.parametrize("code", [0x110000, 0xFFFFFFFF])
+def test_names_of_characters_that_do_not_exist_are_refused(tmp_path, code):
+    names = np.frombuffer(np.array([code], "<u4").tobytes(), "<U1")
+    with pytest.raises(MeshError, match="materials: holds no text"):
+        TriangleMesh.load(npz(tmp_path / "mesh.npz", **(arrays() | {"materials": names})))

@@ -223,12 +223,13 @@ LYING_ARCHIVES = {
     "16 TiB": (_archive_of(("frozen_noise.npy", _npy_claiming((1 << 40, 4)))), "has shape .1099511627776, 4."),
     "the right shape, without its samples": (_archive_of(("frozen_noise.npy", _npy_claiming((2, 4000)))), "claims"),
     "a header that never ends": (_archive_of(("frozen_noise.npy", _npy_claiming("((((("))), "header"),
-    "a bomb": (_archive_of(("frozen_noise.npy", bytes(100_000_000))), "unpacks to 100000000 bytes"),
+    "a bomb": (_archive_of(("frozen_noise.npy", bytes(100_000_000))), "no array file"),
+    "a bomb behind its header": (_archive_of(("frozen_noise.npy", _npy() + bytes(100_000_000))), "and has 100032000"),
     "an array of objects": (_archive_of(("frozen_noise.npy", _npy_claiming((2, 4000), "|O"))), "not numbers|header"),
     "the same name twice": (_archive_of(NOISE, NOISE), "twice"),
     "another beside it": (_archive_of(NOISE, ("more.npy", b"")), "'more.npy'"),
     "a path out of the folder": (_archive_of(NOISE, ("../../evil", b"")), "'../../evil'"),
-    "another name": (_archive_of(("noise.npy", _npy())), "no such array"),
+    "another name": (_archive_of(("noise.npy", _npy())), "is missing"),
     "more samples than claimed": (_archive_of(("frozen_noise.npy", _npy() + bytes(400))), "claims"),
 }
 
