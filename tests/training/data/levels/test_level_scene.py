@@ -69,7 +69,7 @@ def test_folders_at_fault_are_refused_with_the_field(imported, tmp_path, old, ne
 def test_what_simulates_floor_plans_says_that_it_is_a_level(imported, tmp_path):
     imported.scene.write(tmp_path, imported.comments)
     assert tomllib.loads((tmp_path / "scene.toml").read_text(encoding="utf-8"))["geometry"]["mesh"] == "geometry.npz"
-    with pytest.raises(SceneFileError, match=r"geometry\.mesh: .* floor plans"):
+    with pytest.raises(SceneFileError, match=r"geometry\.mesh: .* takes a floor plan"):
         SceneFile.read(tmp_path / "scene.toml")
 
 
