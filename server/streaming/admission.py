@@ -197,8 +197,7 @@ class Admission:
         left = self.spare_cores - load.demand - load.eased_demand
         self.background_share = max(self._limits.least_background, left / 2) if load.streams else math.inf
         self._announce(load)
-        risen_s = max((self._request_on_top_s(stream) for stream in self._engine.streams), default=0.0)
-        has_room = not self._is_on or load.streams <= 1 or fits_on_top(self._limits, self._thresholds, load, risen_s)
+        has_room = not self._is_on or load.streams <= 1 or self._may_rise(load, now_s)
         for thread in self._engine.threads:
             thread.has_room_on_top = has_room
 
@@ -492,6 +491,20 @@ class Admission:
             rate_hz=max(cost.rate_hz, expected.rate_hz),
             patience_s=expected.patience_s,
             is_live=cost.is_live or expected.is_live,
+        )
+
+    def _may_rise(self, load: ServerLoad, now_s: float) -> bool:
+        """Return whether whichever stream is the next to reach the top of its ladder fits there."""
+        return all(
+            fits_on_top(
+                self._limits,
+                self._thresholds,
+                load,
+                self._request_on_top_s(stream),
+                eased=self._cost_of(stream, now_s),
+            )
+            for stream in self._engine.streams
+            if stream.ladder.is_eased
         )
 
     def _request_on_top_s(self, stream: Stream) -> float:

@@ -321,17 +321,22 @@ def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: in
     return "opening" if load.opening_s > limits.most_opening_s * spare else None
 
 
-def fits_on_top(limits: Limits, thresholds: Thresholds, load: ServerLoad, request_s: float) -> bool:
-    """Return whether one more stream, with such requests for IRs there, may step up to the top of its ladder without
-    those who are there having to step down. Those below are served in turn with them, so they must not wait longer."""
+def fits_on_top(
+    limits: Limits, thresholds: Thresholds, load: ServerLoad, request_s: float, *, eased: StreamCost
+) -> bool:
+    """Return whether a stream that the load counts with the cost `eased` may step up to the top of its ladder, where
+    its requests for IRs take `request_s`, without those who are there having to step down. Those who stay below are
+    served in turn with them, so they must not wait longer."""
     spare = min(float(load.workers), spare_cores(limits, thresholds, load))
     risen = replace(
         load,
         round_s=load.round_s + request_s,
         demand=load.demand + request_s * limits.poses_hz,
         patience_s=min(load.patience_s, thresholds.patience_s),
+        eased_round_s=max(0.0, load.eased_round_s - eased.request_s),
+        eased_demand=max(0.0, load.eased_demand - eased.demand),
     )
-    round_s, demand = risen.round_s + load.eased_round_s, risen.demand + load.eased_demand
+    round_s, demand = risen.round_s + risen.eased_round_s, risen.demand + risen.eased_demand
     most_s = limits.full_patience * risen.patience_s * spare
     if round_s > most_s and demand > limits.full_workers * spare:
         return False

@@ -34,6 +34,10 @@ def found(load, cost=QUIET):
     return obstacle(LIMITS, THRESHOLDS, load, 0, cost)
 
 
+def rises(load, request_s, eased):
+    return fits_on_top(LIMITS, THRESHOLDS, load, request_s, eased=eased)
+
+
 def test_a_stream_that_has_the_server_to_itself_always_fits():
     assert found(EMPTY, StreamCost(50.0, loop=3.0, request_s=9.0)) is None
 
@@ -107,9 +111,22 @@ def test_streams_that_end_often_make_waits_short():
 def test_a_stream_steps_up_to_the_top_unless_those_below_would_wait_for_it():
     eased = StreamCost(0.02, request_s=0.003, rate_hz=12.0, patience_s=0.15)
     one_core = replace(EMPTY, threads=(ThreadLoad(),), cores=1)
-    assert fits_on_top(LIMITS, THRESHOLDS, crowd(3, eased, one_core), 0.006)
-    assert not fits_on_top(LIMITS, THRESHOLDS, crowd(20, eased, one_core), 0.006)
-    assert not fits_on_top(LIMITS, THRESHOLDS, crowd(3, eased, one_core), 0.06), "one request takes all there is"
+    assert rises(crowd(3, eased, one_core), 0.006, eased)
+    assert not rises(crowd(20, eased, one_core), 0.006, eased)
+    assert not rises(crowd(3, eased, one_core), 0.06, eased), "one request takes all there is"
+
+
+def test_a_stream_that_steps_up_no_longer_counts_among_those_below():
+    """It fits where it would fit as a newcomer beside the others."""
+    eased, none = StreamCost(0.0, request_s=0.003, rate_hz=12.0, patience_s=0.15), StreamCost(0.0)
+    one_core = replace(EMPTY, threads=(ThreadLoad(),), cores=1)
+    loads = [crowd(number, eased, one_core) for number in range(1, 20)]
+    as_newcomer = [rises(others, 0.006, none) for others in loads[:-1]]
+    assert [rises(all_of_them, 0.006, eased) for all_of_them in loads[1:]] == as_newcomer
+    border = as_newcomer.index(False)
+    assert border > 0
+    assert rises(loads[border], 0.006, eased)
+    assert not rises(loads[border], 0.006, none), "counted twice, it would be one too many"
 
 
 def test_those_below_that_leave_take_their_requests_along():
