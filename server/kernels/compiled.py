@@ -253,7 +253,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         folder = Path(self.cache_path)
         if fcntl is None or not _is_writable(folder):
             return False
-        self._lock = os.open(folder / f"{self._impl.filename_base}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            self._lock = os.open(folder / f"{self._impl.filename_base}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError:  # as where another user made it
+            return False
         for _ in range(round(_LONGEST_COMPILATION_S / _POLL_S)):
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -91,6 +91,18 @@ def test_who_compiles_for_too_long_is_not_waited_for(package):
         assert run(package) == (20, 0)
 
 
+def test_where_the_lock_cannot_be_opened_a_start_compiles_all_the_same(package):
+    """As that of another user, which root could open."""
+    run(package)
+    folder = package / "server" / "__pycache__"
+    (lock,) = folder.glob("outer.outer-*.lock")
+    for kept in folder.glob("outer.outer-*"):
+        kept.unlink()
+    lock.mkdir()
+    assert run(package) == (20, 0)
+    assert run(package) == (20, 1)
+
+
 def test_what_is_kept_runs_without_what_only_compiling_needs(package):
     """Rules of typing and lowering, a third of a second."""
     assert run(package) == (20, 0)
