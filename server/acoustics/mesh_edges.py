@@ -5,10 +5,15 @@ sheets, for seams whose pieces have no common vertices, and for things that stan
 closed. Paths bend at points that are spread along these edges; a path is then drawn taut along the edges themselves
 (`server.acoustics.mesh_paths`).
 
-Axes: P points, on E edges. Points are (..., xyz) in metres, in world axes.
+Where a mesh has too many edges, points are farther apart, and every stretch of an edge keeps one. Where there are too
+many stretches for that, those stay that lead round what hides most places from each other, such as doors.
+
+Axes: P points, on R stretches of E edges. Points are (..., xyz) in metres, in world axes.
 """
 
+import heapq
 import itertools
+import logging
 import math
 from typing import NamedTuple
 
@@ -17,6 +22,7 @@ import numpy.typing as npt
 
 from server.acoustics.mesh import TriangleMesh
 from server.acoustics.mesh_edges_kernel import (
+    SLACK,
     drop_doubles,
     find_seen,
     find_shortest,
@@ -31,22 +37,32 @@ _Flags = npt.NDArray[np.bool_]
 
 MOST_POINTS = 768
 """The most points at which paths bend. Ways between all of them take six bytes a pair."""
-_SPACINGS_M = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
-"""How far points on an edge are apart at most: the first of these that gives few enough."""
+_SPACING_M = 0.25
+"""How far points on an edge are apart at most, unless there would be too many."""
+_COARSER = 1.1
+_MOST_LOOKED_ROUND = 16_384
+"""The most places on edges around which it is looked, some 70 microseconds each."""
 _MOST_EDGES = 8192
-"""The longest edges that are looked at."""
+"""The most sides of triangles that are looked at: the longest and sharpest."""
 _SHORTEST_M = 0.05
-"""Round a shorter edge, sound bends as if nothing were there."""
+"""An edge that is shorter gets no points: paths do not bend there."""
+_EYES, _WAYS_EACH = 256, 2
+"""Of too many stretches, those are kept that lead between so many places, by so many ways for each two of them."""
 _RADIUS_M, _LIFT_M = 0.01, 1e-3
 _LEAST_RAD = math.radians(2)
 _HALVINGS = 8
 _INSET_M = 0.01
 _SAME_VERTEX_M, _SAME_LINE_M = 1e-6, 1e-3
 _PARALLEL = 1 - 1e-8
+_ROWS = 256
 _CELL_M = 1.0
 """The least size of a cell."""
+_AROUND_M = 4.0
+"""How far from all points there are cells."""
 _MOST_LOOKS = 1_500_000
 """Looks from all over the place at all points, a microsecond each."""
+
+_logger = logging.getLogger(__name__)
 
 
 class Bends(NamedTuple):
@@ -55,8 +71,9 @@ class Bends(NamedTuple):
     `facings` (P, 2, 3) are the normals of both surfaces. `lengths` (P, P) are the shortest ways between points, and
     `before` (P, P) the last points on the ways from the first to the second.
 
-    Space is in cells of `cell_m` (3,) from `origin` (3,) on, `counts` (3,) along each axis. The points that are seen
-    from somewhere in a cell are those of `seen` from `begins` (cell,) on.
+    Space around the points is in cells of `cell_m` (3,) from `origin` (3,) on, `counts` (3,) along each axis. The
+    points that are seen from somewhere in a cell are those of `seen` from `begins` (cell,) on, but for some that are
+    seen from a corner of it only. After the last cell there is one more, with all points, for what lies outside.
     """
 
     places: _Floats
@@ -76,15 +93,22 @@ class Bends(NamedTuple):
 
 
 def bends_of(tree: MeshTree) -> Bends:
-    """Find the points of a mesh, at most `MOST_POINTS`, and the ways between them."""
+    """Find the points of a mesh, at most `MOST_POINTS`, and the ways between them. Logs a warning if edges are left
+    out for being too many."""
     edges = _edges(tree.mesh)
-    for spacing_m in _SPACINGS_M:
-        points = _points(tree, edges, spacing_m)
-        if len(points.edge) <= MOST_POINTS:
-            break
-    points = points.only(np.arange(min(MOST_POINTS, len(points.edge))))  # of the longest edges
-    count = len(points.edge)
-    low, high = _reach(tree, edges, points)
+    points = _points(tree, edges)
+    runs = _runs(points)
+    kept = np.arange(len(runs.first))
+    if len(kept) > MOST_POINTS:
+        kept = _most_useful(tree, points, runs)
+        _warn(len(runs.first), MOST_POINTS)
+    runs = runs.only(kept)
+    low, high = _reach(tree, edges, points, runs)
+    chosen, run, portions = _spread(runs)
+    points = points.only(chosen)
+    # At its very end, an edge touches what it ends at, which would be in the way.
+    low, high = np.minimum(low[run] + _INSET_M, points.at), np.maximum(high[run] - _INSET_M, points.at)
+    count = len(chosen)
     steps = np.empty((count, count), np.float32)
     find_steps(tree.tree, points.places, points.lifted, points.facings, steps)
     lengths, before = np.empty_like(steps), np.empty((count, count), np.int16)
@@ -97,10 +121,16 @@ def bends_of(tree: MeshTree) -> Bends:
         edges.starts[points.edge] + low[:, None] * alongs,
         alongs,
         high - low,
-        points.portions,
+        portions,
         lengths,
         before,
-        *_cells(tree, points.lifted),
+        *_cells(tree, points.lifted, steps),
+    )
+
+
+def _warn(number: int, most: int) -> None:
+    _logger.warning(
+        "sound bends round %d of %d edges of the mesh, and the others are left out; simplify the mesh", most, number
     )
 
 
@@ -129,8 +159,25 @@ class _Points(NamedTuple):
         return _Points(self.edge[chosen], *(each[chosen] for each in self[1:]))
 
 
-def _points(tree: MeshTree, edges: _Edges, spacing_m: float) -> _Points:
-    """The points, at most `spacing_m` apart, where edges bend sound."""
+class _Runs(NamedTuple):
+    """Stretches of edges that bend sound: the numbers of the first and the last point on each (R,), and how far points
+    on it are apart (R,)."""
+
+    first: _Integers
+    last: _Integers
+    spacings: _Floats
+
+    @property
+    def counts(self) -> _Integers:
+        return self.last - self.first + 1
+
+    def only(self, chosen: _Integers) -> "_Runs":
+        return _Runs(self.first[chosen], self.last[chosen], self.spacings[chosen])
+
+
+def _points(tree: MeshTree, edges: _Edges) -> _Points:
+    """The points, at most `_MOST_LOOKED_ROUND`, where edges bend sound."""
+    spacing_m = max(_SPACING_M, float(edges.extents.sum()) / (_MOST_LOOKED_ROUND - len(edges.extents)))
     numbers = np.ceil(edges.extents / spacing_m).astype(np.int64)
     edge = np.repeat(np.arange(len(numbers)), numbers)
     portions = (edges.extents / np.maximum(numbers, 1))[edge]
@@ -138,6 +185,65 @@ def _points(tree: MeshTree, edges: _Edges, spacing_m: float) -> _Points:
     places, facings, lifted, bends = _look(tree, edges, edge, at)
     chosen = np.flatnonzero(bends)
     return _Points(edge, at, portions, places, facings, lifted).only(chosen)
+
+
+def _runs(points: _Points) -> _Runs:
+    """The stretches on which points follow each other without a gap."""
+    follows = (np.diff(points.edge) == 0) & (np.diff(points.at) < 1.5 * points.portions[1:])
+    first = np.flatnonzero(np.concatenate([[True], ~follows])[: len(points.edge)])
+    last = np.append(first[1:], len(points.edge))[: len(first)] - 1
+    return _Runs(first, last, points.portions[first])
+
+
+def _spread(runs: _Runs) -> tuple[_Integers, _Integers, _Floats]:
+    """At most `MOST_POINTS` points, spread evenly over at most as many stretches: their numbers, those of their
+    stretches, and for how much of an edge each stands, in metres."""
+    counts, extents = runs.counts, runs.counts * runs.spacings
+    numbers, spacing_m = counts, _SPACING_M
+    while numbers.sum() > MOST_POINTS:
+        spacing_m *= _COARSER
+        numbers = np.minimum(counts, np.ceil(extents / spacing_m).astype(np.int64))
+    run = np.repeat(np.arange(len(counts)), numbers)
+    place = np.arange(len(run)) - np.repeat(np.cumsum(numbers) - numbers, numbers)
+    chosen = runs.first[run] + (2 * place + 1) * counts[run] // (2 * numbers[run])
+    return chosen, run, (extents / numbers)[run]
+
+
+def _most_useful(tree: MeshTree, points: _Points, runs: _Runs) -> _Integers:
+    """The numbers of the `MOST_POINTS` stretches that lead round what hides most places from each other, and of the
+    longest if these are fewer. Places are in the air beside edges and all over the box around them, at random."""
+    middles = points.only((runs.first + runs.last) // 2)
+    rng = np.random.default_rng(0)
+    beside = middles.lifted[rng.choice(len(middles.lifted), _EYES // 2, replace=False)]
+    low, high = middles.lifted.min(axis=0), middles.lifted.max(axis=0)
+    eyes = np.concatenate([beside, rng.uniform(low, high, (_EYES - len(beside), 3))])
+    seen, in_sight = np.empty((_EYES, len(middles.lifted)), np.bool_), np.empty((_EYES, _EYES), np.bool_)
+    find_seen(tree.tree, eyes, middles.lifted, seen)
+    find_seen(tree.tree, eyes, eyes, in_sight)
+    for eye in range(_EYES):
+        away = eyes[eye] - middles.places
+        slack = SLACK * np.linalg.norm(away, axis=-1, keepdims=True)
+        seen[eye] &= np.any(np.sum(middles.facings * away[:, None], axis=-1) <= slack, axis=-1)
+    # How many ways each two places that do not see each other still lack.
+    lack = np.where(in_sight & in_sight.T, 0, _WAYS_EACH)
+    extents = runs.counts * runs.spacings
+    of_run = seen.T.astype(np.float32)
+    gains = np.sum((of_run @ (lack > 0).astype(np.float32)) * of_run, axis=-1)
+    # What a stretch adds never grows: what was the best, and still is when it is counted anew, is the best of all.
+    waits = [(-gain, -extent, run) for run, (gain, extent) in enumerate(zip(gains, extents, strict=True)) if gain > 0]
+    heapq.heapify(waits)
+    chosen: list[int] = []
+    while waits and len(chosen) < MOST_POINTS:
+        _, extent, run = heapq.heappop(waits)
+        between = np.ix_(seen[:, run], seen[:, run])
+        gain = np.count_nonzero(lack[between])
+        if gain and (not waits or gain >= -waits[0][0]):
+            chosen.append(run)
+            lack[between] -= lack[between] > 0
+        elif gain:
+            heapq.heappush(waits, (-gain, extent, run))
+    others = np.setdiff1d(np.argsort(-extents, kind="stable"), chosen, assume_unique=True)
+    return np.sort(np.concatenate([np.array(chosen, np.int64), others[: MOST_POINTS - len(chosen)]]))
 
 
 def _look(tree: MeshTree, edges: _Edges, edge: _Integers, at: _Floats) -> tuple[_Floats, _Floats, _Floats, _Flags]:
@@ -149,34 +255,23 @@ def _look(tree: MeshTree, edges: _Edges, edge: _Integers, at: _Floats) -> tuple[
     return places, facings, lifted, bends
 
 
-def _reach(tree: MeshTree, edges: _Edges, points: _Points) -> tuple[_Floats, _Floats]:
-    """From where to where along its edge each point may move (P,): as far as the edge bends sound."""
-    ends = []
-    for way in (-1, 1):
-        last = points.at + way * points.portions / 2
-        limit = np.where(way < 0, 0.0, edges.extents[points.edge])
-        beyond = np.roll(points.at, -way)  # the next point on the edge, if it has no gap before
-        joins = (np.roll(points.edge, -way) == points.edge) & (np.abs(beyond - points.at) < 1.5 * points.portions)
-        is_last = ~joins & (np.abs(last - limit) > _SAME_LINE_M)
+def _reach(tree: MeshTree, edges: _Edges, points: _Points, runs: _Runs) -> tuple[_Floats, _Floats]:
+    """From where to where along its edge each stretch bends sound (R,), both in metres."""
+    edge, ends = points.edge[runs.first], []
+    for way, outermost, limit in ((-1, runs.first, np.zeros(len(edge))), (1, runs.last, edges.extents[edge])):
         # Between a place that bends sound and one that does not.
-        inside, outside = points.at.copy(), np.clip(points.at + way * points.portions, 0.0, edges.extents[points.edge])
-        some = np.flatnonzero(is_last)
+        inside = points.at[outermost]
+        outside = np.clip(inside + way * runs.spacings, 0.0, edges.extents[edge])
+        some = np.flatnonzero(np.abs(inside + way * runs.spacings / 2 - limit) > _SAME_LINE_M)
         for _ in range(_HALVINGS):
             middle = (inside[some] + outside[some]) / 2
-            bends = _look(tree, edges, points.edge[some], middle)[3]
+            bends = _look(tree, edges, edge[some], middle)[3]
             inside[some] = np.where(bends, middle, inside[some])
             outside[some] = np.where(bends, outside[some], middle)
-        ends.append((joins, np.where(is_last, inside, limit)))
-    (joins_before, low), (joins_after, high) = ends
-    # Points of one run may move all along it.
-    for point in range(1, len(points.edge)):
-        if joins_before[point]:
-            low[point] = low[point - 1]
-    for point in range(len(points.edge) - 2, -1, -1):
-        if joins_after[point]:
-            high[point] = high[point + 1]
-    # At its very end, an edge touches what it ends at, which would be in the way.
-    return np.minimum(low + _INSET_M, points.at), np.maximum(high - _INSET_M, points.at)
+        reach = np.array(limit)
+        reach[some] = inside[some]
+        ends.append(reach)
+    return ends[0], ends[1]
 
 
 def _edges(mesh: TriangleMesh) -> _Edges:
@@ -204,10 +299,14 @@ def _edges(mesh: TriangleMesh) -> _Edges:
     normal, other_normal = mesh.normals[owner[first]], mesh.normals[owner[last]]
     is_flat = np.sum(one * other, axis=-1) < -math.cos(_LEAST_RAD)
     is_hollow = (np.sum(normal * other, axis=-1) > 0) & (np.sum(other_normal * one, axis=-1) > 0)
-    may_bend = ((counts != 2) | ~(is_flat | is_hollow)) & (extent > 0)
-    sides, along, extent, one = (each[may_bend] for each in (sides, along, extent, one))
-    longest = np.argsort(-extent, kind="stable")[:_MOST_EDGES]
-    sides, along, extent, one = (each[longest] for each in (sides, along, extent, one))
+    may_bend = np.flatnonzero(((counts != 2) | ~(is_flat | is_hollow)) & (extent > 0))
+    if len(may_bend) > _MOST_EDGES:
+        _warn(len(may_bend), _MOST_EDGES)
+        # Of a fine ground, most sides are nearly flat.
+        turn_rad = np.where(counts == 2, math.pi - np.arccos(np.clip(np.sum(one * other, axis=-1), -1, 1)), math.pi)
+        may_bend = may_bend[np.argsort(-(extent * turn_rad)[may_bend], kind="stable")[:_MOST_EDGES]]
+    longest = may_bend[np.argsort(-extent[may_bend], kind="stable")]
+    sides, along, extent, one = sides[longest], along[longest], extent[longest], one[longest]
     base, low, high = _joined(place, sides, along, extent)
     edge = np.flatnonzero(high - low >= _SHORTEST_M)
     edge = edge[np.argsort(-(high - low)[edge], kind="stable")]
@@ -219,8 +318,9 @@ def _edges(mesh: TriangleMesh) -> _Edges:
 
 
 def _joined(place: _Floats, sides: _Integers, along: _Floats, extent: _Floats) -> tuple[_Floats, _Floats, _Floats]:
-    """Join sides that continue each other. Of the longest of each line, its beginning, and how far the line reaches
-    along it from there, before (negative) and after; others reach nowhere."""
+    """Join sides that continue each other to lines. Returns where each side begins (E, 3), and how far the line goes
+    on from there along the side, to before it (negative) and to after it (E,): for the longest side of each line. For
+    its other sides both are zero."""
     label = list(range(len(sides)))
 
     def root(edge: int) -> int:
@@ -235,9 +335,13 @@ def _joined(place: _Floats, sides: _Integers, along: _Floats, extent: _Floats) -
         meeting = order[begin:end]
         # Directions away from the vertex.
         away = np.where((meeting < len(sides))[:, None], 1.0, -1.0) * along[meeting % len(sides)]
-        for one, other in zip(*np.nonzero(np.triu(away @ away.T < -_PARALLEL, 1)), strict=True):
-            first, second = sorted((root(int(meeting[one] % len(sides))), root(int(meeting[other] % len(sides)))))
-            label[second] = first  # the longer one is before
+        for row in range(0, len(meeting), _ROWS):
+            goes_on = away[row : row + _ROWS] @ away.T < -_PARALLEL
+            # One is enough: sides that go on in the same direction from here join the same ones.
+            for one in np.flatnonzero(goes_on.any(axis=-1)):
+                other = int(np.argmax(goes_on[one]))
+                both = root(int(meeting[row + one] % len(sides))), root(int(meeting[other] % len(sides)))
+                label[max(both)] = min(both)  # the longer one is before
     base = place[sides[:, 0]]
     low, high = np.zeros(len(sides)), np.zeros(len(sides))
     high[:] = [length if label[edge] == edge else 0.0 for edge, length in enumerate(extent)]
@@ -249,33 +353,46 @@ def _joined(place: _Floats, sides: _Integers, along: _Floats, extent: _Floats) -
     return base, low, high
 
 
-def _cells(tree: MeshTree, lifted: _Floats) -> tuple[_Floats, _Floats, _Integers, _Integers, npt.NDArray[np.int32]]:
-    """The last five fields of `Bends`. What is seen from a cell is what is seen from its corners or its middle."""
+def _cells(
+    tree: MeshTree, lifted: _Floats, steps: npt.NDArray[np.float32]
+) -> tuple[_Floats, _Floats, _Integers, _Integers, npt.NDArray[np.int32]]:
+    """The last five fields of `Bends`. What is seen from a cell is what is seen from its corners, its middle, or a
+    point in it."""
+    if not len(lifted):
+        return np.zeros(3), np.ones(3), np.ones(3, np.int64), np.zeros(3, np.int64), np.zeros(0, np.int32)
     low, high = tree.mesh.bounds_m
+    low = np.maximum(low, lifted.min(axis=0) - _AROUND_M)
+    size = np.maximum(np.minimum(high, lifted.max(axis=0) + _AROUND_M) - low, 1e-9)
     size_m = _CELL_M
     while True:
-        counts = np.maximum(1, np.ceil((high - low) / size_m - 1e-9)).astype(np.int64)
-        if 2 * int(np.prod(counts + 1)) * len(lifted) <= _MOST_LOOKS or counts.max() == 1:
+        cells = np.maximum(1.0, np.ceil(size / size_m - 1e-9))
+        if 2 * np.prod(cells + 1) * len(lifted) <= _MOST_LOOKS or cells.max() == 1:
             break
         size_m *= 1.25
+    counts, cell_m = cells.astype(np.int64), size / cells
     # Corners on the outermost surfaces would look along them.
-    inset_m = np.minimum(0.05, 0.05 * (high - low))
-    first, last = low + inset_m, high - inset_m
-    axes = [np.linspace(first[axis], last[axis], int(counts[axis]) + 1) for axis in range(3)]
-    corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    inset_m = np.minimum(0.05, 0.05 * size)
+    axes = [
+        np.linspace(inset, side - inset, count + 1) for inset, side, count in zip(inset_m, size, counts, strict=True)
+    ]
+    corners = low + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     middles = (corners[:-1, :-1, :-1] + corners[1:, 1:, 1:]) / 2
-    of_corners, of_middles = (np.zeros((eyes[..., 0].size, len(lifted)), np.bool_) for eyes in (corners, middles))
-    for eyes, seen in ((corners, of_corners), (middles, of_middles)):
+    of_corners, of_cells = (np.zeros((eyes[..., 0].size, len(lifted)), np.bool_) for eyes in (corners, middles))
+    for eyes, seen in ((corners, of_corners), (middles, of_cells)):
         find_seen(tree.tree, np.ascontiguousarray(eyes.reshape(-1, 3)), lifted, seen)
     around = of_corners.reshape(*corners.shape[:3], len(lifted))
     for x, y, z in itertools.product((slice(None, -1), slice(1, None)), repeat=3):
-        of_middles |= around[x, y, z].reshape(of_middles.shape)
-    cell, point = np.nonzero(of_middles)
-    begins = np.searchsorted(cell, np.arange(int(counts.prod()) + 1))
+        of_cells |= around[x, y, z].reshape(of_cells.shape)
+    within = np.clip((lifted - low) // cell_m, 0, counts - 1).astype(np.int64)
+    for point, cell in enumerate(np.ravel_multi_index(tuple(within.T), tuple(counts))):
+        of_cells[cell] |= steps[point] < np.inf
+        of_cells[cell, point] = True
+    cells_seen, point_seen = np.nonzero(of_cells)
+    begins = np.searchsorted(cells_seen, np.arange(len(of_cells) + 1))
     return (
-        np.array(low),
-        np.maximum((high - low) / counts, 1e-9),
+        low,
+        cell_m,
         counts,
-        begins.astype(np.int64),
-        point.astype(np.int32),
+        np.append(begins, begins[-1] + len(lifted)).astype(np.int64),
+        np.concatenate([point_seen, np.arange(len(lifted))]).astype(np.int32),
     )

@@ -31,8 +31,8 @@ class MeshPathFinder:
         """Find the paths to `listener` (3,) from `emitters` (n, 3). They are written to `into`, which must have n rows,
         if it is given.
 
-        An emitter that no path reaches, as in a closed cupboard, is hidden; its path is the straight line, at -100 dB
-        in every band.
+        An emitter that no path reaches by any of the points of `Bends`, as in a closed cupboard, is hidden; its path is
+        the straight line, at -100 dB in every band.
         """
         listener = np.ascontiguousarray(listener, dtype=np.float64)
         emitters = np.ascontiguousarray(emitters, dtype=np.float64)

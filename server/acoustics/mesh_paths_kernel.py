@@ -41,12 +41,20 @@ def _distance(a: Floats, b: Floats) -> float:
 
 @compiled
 def _cell(bends: Bends, place: Floats) -> int:
-    """The cell of a place, or the nearest one."""
+    """The cell of a place."""
     cell = 0
     for axis in range(3):
         step = math.floor((place[axis] - bends.origin[axis]) / bends.cell_m[axis])
-        cell = cell * bends.counts[axis] + min(max(step, 0), bends.counts[axis] - 1)
+        if step < 0 or step >= bends.counts[axis]:
+            return _everywhere(bends)
+        cell = cell * bends.counts[axis] + step
     return cell
+
+
+@compiled
+def _everywhere(bends: Bends) -> int:
+    """The number of the cell that has all points."""
+    return len(bends.begins) - 2
 
 
 @compiled
@@ -89,17 +97,22 @@ def _clearance_m(
     bends: Bends,
     listener: Floats,
     emitter: Floats,
+    cell: int,
+    cell_too: int,
     straight: float,
     most_m: float,
     sight: npt.NDArray[np.int8],
     spot: Floats,
 ) -> float:
-    """How much longer the path over the nearest edge is than the straight line, for a visible emitter, as
-    `sound_path_kernel` measures it across edges; at least `most_m` if nothing is near."""
+    """How much longer the path over the nearest edge that both see is than the straight line, for a visible emitter,
+    as `sound_path_kernel` measures it across edges; `most_m` if nothing is near. The same both ways."""
     clearance = most_m
-    cell = _cell(bends, listener)
-    for number in range(bends.begins[cell], bends.begins[cell + 1]):
-        point = bends.seen[number]
+    begin, end = bends.begins[cell], bends.begins[cell + 1]
+    begin_too, end_too = bends.begins[cell_too], bends.begins[cell_too + 1]
+    if cell_too == cell:
+        end_too = begin_too
+    for turn in range(end - begin + end_too - begin_too):
+        point = bends.seen[begin + turn if turn < end - begin else begin_too + turn - (end - begin)]
         # Cheaper than what follows, and most points are farther away. Each stands for its part of an edge.
         beside = _distance(listener, bends.places[point]) + _distance(bends.places[point], emitter) - straight
         if beside > most_m + bends.portions[point]:
@@ -118,17 +131,20 @@ def _clearance_m(
         if to_emitter < COINCIDENT_M or to_listener < COINCIDENT_M or ahead <= 0:
             continue
         detour *= to_listener * to_emitter / ahead
-        if detour < clearance and _is_seen(tree, stack, bends, listener, point, sight):
+        if (
+            detour < clearance
+            and _is_seen(tree, stack, bends, listener, point, sight)
+            and is_clear(tree, stack, emitter, bends.lifted[point], MARGIN_M)
+        ):
             clearance = detour
     return clearance
 
 
 @compiled
-def _reach(bends: Bends, listener: Floats, reached: Integers, reach_m: Float32) -> int:
-    """Write the points round which sound may bend to the listener, seen or not, and their distances; return their
-    number."""
+def _reach(bends: Bends, listener: Floats, cell: int, reached: Integers, reach_m: Float32) -> int:
+    """Write the points of a cell round which sound may bend to the listener, seen or not, and their distances; return
+    their number."""
     count = 0
-    cell = _cell(bends, listener)
     for number in range(bends.begins[cell], bends.begins[cell + 1]):
         point = bends.seen[number]
         if may_bend(bends.places, bends.facings, point, listener):
@@ -156,6 +172,7 @@ def _way_round(
     bends: Bends,
     listener: Floats,
     emitter: Floats,
+    cell: int,
     sight: npt.NDArray[np.int8],
     reached: Integers,
     reach_m: Float32,
@@ -165,13 +182,13 @@ def _way_round(
     waits: Integers,
     wait_m: Float32,
 ) -> int:
-    """The last point on the shortest way from the listener; -1 if there is none. `to_point` (point,) and `near_of` keep
-    lengths from the listener, and the numbers of the first points on these ways; negative lengths are not known yet.
+    """The last point on the shortest way from the listener, out of those of a cell; -1 if there is none. `to_point`
+    (point,) and `near_of` keep lengths from the listener, and the numbers of the first points on these ways; negative
+    lengths are not known yet.
 
     What is not known to be hidden is taken for seen, and looked at when a way by it is the shortest. So is the length
     of the way to a point: until then, it is taken for the straight one.
     """
-    cell = _cell(bends, emitter)
     waiting = 0
     for number in range(bends.begins[cell], bends.begins[cell + 1]):
         point = bends.seen[number]
@@ -343,7 +360,7 @@ def find_mesh_paths(
     for band in range(len(wavelengths_m)):
         longest_m = max(longest_m, wavelengths_m[band])
     most_m = -CLEAR_FRESNEL_NUMBER * longest_m / 2
-    count = -1
+    everywhere, listener_cell, reached_cell, count = _everywhere(bends), _cell(bends, listener), -1, 0
     for row in range(len(emitters)):
         emitter = emitters[row]
         straight = _distance(listener, emitter)
@@ -353,25 +370,49 @@ def find_mesh_paths(
         for axis in range(3):
             departure[row, axis] = -arrival[row, axis]
         if in_sight[row]:
-            detour = -_clearance_m(tree, stack, bends, listener, emitter, straight, most_m, sight, ends[3])
-        else:
-            if count < 0:
-                count = _reach(bends, listener, reached, reach_m)
-            last = _way_round(
+            detour = -_clearance_m(
                 tree,
                 stack,
                 bends,
                 listener,
                 emitter,
+                listener_cell,
+                _cell(bends, emitter),
+                straight,
+                most_m,
                 sight,
-                reached,
-                reach_m,
-                count,
-                to_point,
-                near_of,
-                waits,
-                wait_m,
+                ends[3],
             )
+        else:
+            if reached_cell < 0:
+                reached_cell = listener_cell
+                count = _reach(bends, listener, reached_cell, reached, reach_m)
+            last, cell = -1, _cell(bends, emitter)
+            while True:
+                last = _way_round(
+                    tree,
+                    stack,
+                    bends,
+                    listener,
+                    emitter,
+                    cell,
+                    sight,
+                    reached,
+                    reach_m,
+                    count,
+                    to_point,
+                    near_of,
+                    waits,
+                    wait_m,
+                )
+                if last >= 0 or (cell == everywhere and reached_cell == everywhere):
+                    break
+                # Cells lack points that are seen from small parts of them.
+                if reached_cell != everywhere:
+                    reached_cell = everywhere
+                    count = _reach(bends, listener, reached_cell, reached, reach_m)
+                    to_point[:] = -1.0
+                cell = everywhere
             if last < 0:
                 for band in range(len(wavelengths_m)):
                     screen_db[row, band] = UNHEARD_DB

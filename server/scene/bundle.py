@@ -39,6 +39,8 @@ MOST_FILE_BYTES = 2**31 - 1
 messages."""
 MOST_TRIANGLES = 200_000
 """The most triangles of a mesh. Paths are looked for in it whenever something moves."""
+LONGEST_MESH_M = 1_000.0
+"""The longest side of the box around a mesh."""
 _CHUNK_BYTES = 2**20
 _WIDEST_SAMPLE_BYTES = 8
 _ARCHIVE_OVERHEAD_BYTES = 2**16
@@ -109,11 +111,15 @@ class Bundle:
         return None if self.manifest.geometry is None else self.manifest.geometry.materials.surfaces
 
     def _require_places(self, path: Path) -> None:
-        """Raises BundleError if the places that the manifest names do not lie in the air of the mesh. Those in a floor
-        plan are checked with the manifest."""
-        if self.mesh is None:
+        """Raises BundleError if the mesh is too large, and if the places that the manifest names do not lie in its air.
+        Those in a floor plan are checked with the manifest."""
+        if self.mesh is None or self.manifest.mesh is None:
             return
         manifest, (low, high) = self.manifest, self.mesh.bounds_m
+        if np.max(high - low) > LONGEST_MESH_M:
+            sides = " x ".join(f"{side:.0f}" for side in high - low)
+            problem = f"fills {sides} m: leave at most {LONGEST_MESH_M:g} m along each axis, and give metres"
+            raise BundleError(path.parent / self.manifest.mesh.file, "vertices_m", problem)
         if np.any(manifest.bounds.minimum < low) or np.any(manifest.bounds.maximum > high):
             box = " to ".join(str([round(float(side), 3) for side in corner]) for corner in (low, high))
             raise BundleError(path, "bounds", f"must lie in the box around the mesh, {box}")

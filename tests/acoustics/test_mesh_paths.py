@@ -1,6 +1,7 @@
 """Shortest paths in meshes: against the same floor plans, against screens and openings whose paths are known, and
 against paths over points strewn along the edges."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.diffraction import diffraction_gain_db
 from server.acoustics.mesh import TriangleMesh
-from server.acoustics.mesh_edges import MOST_POINTS, bends_of
+from server.acoustics.mesh_edges import MOST_POINTS, _edges, bends_of
 from server.acoustics.mesh_paths import MeshPathFinder
 from server.acoustics.mesh_tree import MeshTree
 from server.acoustics.sound_path import PlanPathFinder
@@ -241,13 +242,118 @@ def test_what_describes_a_path_is_what_the_path_says(in_house):
         )
 
 
-def test_a_mesh_with_too_many_edges_keeps_the_longest():
-    rng = np.random.default_rng(1)
-    low = rng.uniform((0, 0, 0), (9, 7, 2.5), (150, 3))
-    blocks = [block(at, at + size) for at, size in zip(low, rng.uniform(0.1, 0.4, (150, 3)), strict=True)]
-    bends = bends_of(MeshTree(mesh_of(ROOM, *blocks)))
-    assert 0 < len(bends.places) <= MOST_POINTS
-    assert np.isfinite(bends.lengths).mean() > 0.5
+def rooms_with_beams(beams):
+    """Two rooms of 30 m with a door between them, and thin beams all along their ceilings."""
+    return (
+        (CUBE * (60.2, 30, 4), OF_AIR),
+        block((30, 0, 0), (30.2, 14, 4)),
+        block((30, 15, 0), (30.2, 30, 4)),
+        block((30, 14, 2.1), (30.2, 15, 4)),
+        *[
+            block((low, y, 3.5), (low + 29.8, y + 0.02, 3.6))
+            for low in (0.1, 30.3)
+            for y in np.linspace(0.1, 29.8, beams // 2)
+        ],
+    )
+
+
+@pytest.mark.parametrize("beams", [50, 200])
+def test_beams_without_number_do_not_close_a_door(beams, caplog):
+    rng = np.random.default_rng(2)
+    listener, emitters = (20, 8, 1.5), rng.uniform((31, 1, 0.3), (59, 29, 2.0), (40, 3))
+    expected = finder_of(*rooms_with_beams(0)).find(listener, emitters)
+    bends = bends_of(tree := MeshTree(mesh_of(*rooms_with_beams(beams))))
+    found = MeshPathFinder(tree, SPEED, bends).find(listener, emitters)
+    assert len(bends.places) <= MOST_POINTS
+    assert np.count_nonzero(~expected.in_sight) > 30
+    np.testing.assert_array_equal(found.in_sight, expected.in_sight)
+    np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.05)
+    np.testing.assert_allclose(found.screen_db, expected.screen_db, atol=1)
+    # Each of 200 beams has eight edges.
+    assert ("left out" in caplog.text) == (beams == 200)
+
+
+def small_house(at=(0, 0, 0)):
+    """10 m wide, with a wall of which a door is open, on a ground of 20 m."""
+    parts = (
+        sheet((-5, -7, 0), (15, -7, 0), (15, 13, 0), (-5, 13, 0)),
+        block((0, 0, 2.6), (10, 6, 2.8)),
+        *(block((x, 0, 0), (x + 0.2, 6, 2.6)) for x in (0, 9.8)),
+        *(block((0, y, 0), (10, y + 0.2, 2.6)) for y in (0, 5.8)),
+        block((5, 0.2, 0), (5.2, 4, 2.6)),
+        block((5, 4.9, 0), (5.2, 5.8, 2.6)),
+        block((5, 4, 2.0), (5.2, 4.9, 2.6)),
+    )
+    return tuple((vertices + np.asarray(at), faces) for vertices, faces in parts)
+
+
+@pytest.mark.parametrize("half_m", [200, 490])
+def test_a_sky_far_away_takes_no_sound_from_a_house(half_m):
+    points = np.random.default_rng(4).uniform((0.3, 0.3, 0.2), (9.7, 5.7, 2.5), (60, 3))
+    tree = MeshTree(mesh_of(*small_house()))
+    points = points[(tree.distance_m(points) > 0.05) & ((points[:, 0] < 5) | (points[:, 0] > 5.2))]
+    sky = (CUBE * 2 * half_m - (half_m, half_m, 1), OF_AIR)
+    alone, under_sky = MeshPathFinder(tree, SPEED), finder_of(sky, *small_house())
+    for listener in points:
+        expected, found = alone.find(listener, points), under_sky.find(listener, points)
+        assert expected.screen_db.min() > -60
+        np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.05)
+        np.testing.assert_allclose(found.screen_db, expected.screen_db, atol=1)
+
+
+def test_a_house_far_from_the_origin_leads_sound_as_before():
+    far = np.array([7000.0, -4000.0, 300.0])
+    near, moved = finder_of(*small_house()), finder_of(*small_house(far))
+    points = np.random.default_rng(4).uniform((-3, -5, 0.2), (13, 11, 4), (60, 3))
+    hidden = 0
+    for listener in points[:20]:
+        expected, found = near.find(listener, points), moved.find(listener + far, points + far)
+        np.testing.assert_array_equal(found.in_sight, expected.in_sight)
+        np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.02)
+        hidden += np.count_nonzero(~expected.in_sight)
+    assert hidden > 100
+
+
+def test_a_cell_that_lacks_the_only_way_out_closes_no_room():
+    """A closet with a slit under its ceiling, in a place whose cells lack all points."""
+    closet = (
+        block((0.3, 0.3, 0.0), (0.7, 0.35, 3.0)),
+        block((0.3, 0.65, 0.0), (0.7, 0.7, 3.0)),
+        block((0.3, 0.35, 0.0), (0.35, 0.65, 3.0)),
+        block((0.65, 0.35, 0.0), (0.7, 0.65, 2.9)),
+    )
+    tree = MeshTree(mesh_of(ROOM, *closet))
+    bends = bends_of(tree)
+    begins = np.zeros_like(bends.begins)
+    begins[-1] = len(bends.places)
+    blind = bends._replace(begins=begins, seen=np.arange(len(bends.places), dtype=np.int32))
+    emitters = np.array([(8, 6, 1), (0.5, 0.5, 2.0), (0.2, 0.2, 1.0), (3, 1, 2)])
+    for listener in ((0.5, 0.5, 0.5), (9, 1, 1)):
+        expected, found = (MeshPathFinder(tree, SPEED, each).find(listener, emitters) for each in (bends, blind))
+        assert expected.screen_db.min() > -80
+        np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.1)
+
+
+def test_vast_meshes_take_bounded_work():
+    """A box without edges to bend round, and sheets, one of which is as long as a country."""
+    assert len(bends_of(MeshTree(mesh_of((CUBE * (1000, 1000, 300), OF_AIR)))).places) == 0
+    for size_m in (1e3, 2e6):
+        vast = bends_of(MeshTree(mesh_of(sheet((0, 0, 0), (size_m, 0, 0), (size_m, size_m, 0), (0, size_m, 0)))))
+        assert 0 < len(vast.places) <= MOST_POINTS
+        np.testing.assert_allclose(vast.extents, size_m, rtol=1e-3)
+        assert vast.begins[-1] < 2_000_000
+
+
+def test_thousands_of_edges_that_meet_in_a_place_take_little_memory():
+    ways = np.random.default_rng(1).standard_normal((4000, 2, 3))
+    corners = np.concatenate([np.zeros((4000, 1, 3)), ways], axis=1).reshape(-1, 3)
+    mesh = TriangleMesh(corners, np.arange(12000).reshape(-1, 3), np.zeros(4000, int), ("all",))
+    tracemalloc.start()
+    try:
+        assert 4000 < len(_edges(mesh).extents) <= 8192
+        assert tracemalloc.get_traced_memory()[1] < 60e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_mesh_without_edges_to_bend_round_has_straight_paths():

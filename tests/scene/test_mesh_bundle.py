@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from server.acoustics.mesh import TriangleMesh
 from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings
 from server.api.catalogue import describe_scene
 from server.core.errors import BundleError, RequestError
@@ -126,6 +127,21 @@ def test_a_field_of_directions_is_heard_in_a_mesh_as_in_the_plan(tmp_path):
         for each in (plan, bundle)
     )
     assert np.sum((one - other) ** 2) < 1e-6 * np.sum(one**2)
+
+
+def test_a_mesh_that_is_too_large_is_refused_by_file_and_field(as_mesh, tmp_path):
+    low, high = PLACE.mesh.bounds_m
+    far = np.append(PLACE.mesh.vertices_m, [low, low + np.array([1000.5, 0, 0]), high], axis=0)
+    count = len(far)
+    large = TriangleMesh(
+        far,
+        np.append(PLACE.mesh.triangles, [(count - 3, count - 2, count - 1)], axis=0),
+        np.append(PLACE.mesh.surfaces, 0),
+        PLACE.mesh.materials,
+    )
+    document = as_mesh.manifest.model_dump(mode="json") | {"files": {"geometry.npz": "0" * 64}}
+    with pytest.raises(BundleError, match=r"geometry\.npz: vertices_m.* fills 100[01] x .* at most 1000 m"):
+        write_bundle(tmp_path, Manifest.model_validate(document), {"geometry.npz": large.to_bytes()})
 
 
 def test_places_inside_a_wall_are_refused(as_mesh):
