@@ -27,14 +27,9 @@ class BundleFiles(BaseModel):
 
     @classmethod
     def of(cls, bundle: Bundle) -> Self:
-        files = cls.digests(bundle).items()
-        return cls(
-            scene=bundle.id,
-            files=tuple(
-                BundleFile(name=name, bytes=(bundle.folder / name).stat().st_size, sha256=digest)
-                for name, digest in files
-            ),
-        )
+        digests = cls.digests(bundle).items()
+        files = (BundleFile(name=name, bytes=len(bundle.contents[name]), sha256=digest) for name, digest in digests)
+        return cls(scene=bundle.id, files=tuple(files))
 
     @staticmethod
     def digests(bundle: Bundle) -> dict[str, str]:

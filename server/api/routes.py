@@ -24,7 +24,7 @@ from server.api.catalogue import describe_encodings, describe_scene, playable_cl
 from server.api.connection import Connection, StreamHost
 from server.api.frontier import Frontier
 from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, AskedStream, SettledStream, merged
-from server.api.ranged_files import RangedFile
+from server.api.ranged_files import RangedBytes, RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
@@ -410,7 +410,7 @@ async def plan(
 
 
 @api.get("/scenes/{scene}/bundle")
-def bundle(request: Request, scene: ScenePath) -> BundleFiles:
+async def bundle(request: Request, scene: ScenePath) -> BundleFiles:
     """The files of a scene's bundle, for programs that compute responses themselves."""
     return BundleFiles.of(_offered_bundle(request, scene))
 
@@ -428,9 +428,7 @@ async def bundle_file(
     if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
         return Response(status_code=304, headers=headers)
     media_type = "application/json" if file.endswith(".json") else "application/octet-stream"
-    path = offered.folder / file
-    stat_result = await anyio.to_thread.run_sync(path.stat)
-    return RangedFile(path, headers=headers, media_type=media_type, stat_result=stat_result)
+    return RangedBytes(offered.contents[file], headers=headers, media_type=media_type)
 
 
 def _offered_bundle(request: Request, scene: str) -> Bundle:

@@ -60,7 +60,7 @@ def bundle_of(scene: str) -> Bundle:
     if scene != SCENE:
         return Bundle.load(find_bundle(scene))
     noise = np.zeros((2, _SAMPLES), np.float32)
-    return Bundle(folder=Path(), manifest=_MANIFEST, digest="", models={}, frozen_noise=noise)
+    return Bundle(folder=Path(), manifest=_MANIFEST, digest="", contents={}, frozen_noise=noise)
 
 
 def levels_of(scene: str) -> FieldsByLevel:

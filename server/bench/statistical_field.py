@@ -102,7 +102,7 @@ class StatisticalField(AcousticField):
             folder=Path(),
             manifest=_manifest(name, rooms, corners, samples),
             digest=name,
-            models={},
+            contents={},
             frozen_noise=np.zeros((2, samples), np.float32),
         )
         self.level = self.bundle.manifest.levels[0]

@@ -48,13 +48,14 @@ _ARCHIVE_OVERHEAD_BYTES = 2**16
 
 @dataclass(frozen=True)
 class Bundle:
-    """A checked scene bundle. `models` holds the bytes of the ONNX files by name. `frozen_noise` (2, sample) is empty
-    if the scene has no fields. `mesh` is None for a floor plan, and where walls are unknown."""
+    """A checked scene bundle. `contents` holds the bytes of its files by name, `scene.json` among them, as they were
+    checked: those in the folder may be others by now. `frozen_noise` (2, sample) is empty if the scene has no fields.
+    `mesh` is None for a floor plan, and where walls are unknown."""
 
     folder: Path
     manifest: Manifest
     digest: str
-    models: dict[str, bytes]
+    contents: dict[str, bytes]
     frozen_noise: npt.NDArray[np.float32]
     mesh: TriangleMesh | None = None
 
@@ -82,15 +83,19 @@ class Bundle:
         noise = np.zeros((2, 0), np.float32)
         if manifest.fields:
             noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
-        models = {name: data for name, data in contents.items() if name.endswith(".onnx")}
         mesh = None if manifest.mesh is None else _mesh(folder, manifest.mesh, contents[manifest.mesh.file])
-        bundle = cls(folder, manifest, hashlib.sha256(text).hexdigest(), models, noise, mesh)
+        bundle = cls(folder, manifest, hashlib.sha256(text).hexdigest(), {MANIFEST_FILE: text, **contents}, noise, mesh)
         bundle._require_places(path)
         return bundle
 
     @property
     def id(self) -> str:
         return self.manifest.id
+
+    @cached_property
+    def models(self) -> dict[str, bytes]:
+        """The ONNX files by name."""
+        return {name: data for name, data in self.contents.items() if name.endswith(".onnx")}
 
     @cached_property
     def floor_plan(self) -> FloorPlan:
@@ -228,7 +233,11 @@ def _read(folder: Path, name: str, most_bytes: int, *, sha256: str | None = None
             if sha256 is not None and _hash_of(stream, most_bytes) != sha256:
                 raise BundleError(path, "sha256", f"differs from the one in {MANIFEST_FILE}; the file is damaged")
             stream.seek(0)
-            return stream.read(status.st_size)
+            data = stream.read(status.st_size)
+            # guard: what is kept of a file is what was checked
+            if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+                raise BundleError(path, "sha256", f"differs from the one in {MANIFEST_FILE}; it changes meanwhile")
+            return data
     except OSError as exc:
         raise BundleError(path, "file", f"cannot be read: {exc.strerror}") from exc
     except RuntimeError as exc:  # a circle of links

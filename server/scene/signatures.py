@@ -43,12 +43,12 @@ def _ed25519() -> Any:
 
 
 def _decoded(text: str, size: int) -> bytes | None:
-    """Bytes in base64; None unless there are so many."""
+    """Bytes in base64, of which each text stands for others; None unless there are so many."""
     try:
         data = base64.b64decode(text.strip(), validate=True)
     except (binascii.Error, ValueError):
         return None
-    return data if len(data) == size else None
+    return data if len(data) == size and _text(data) == text.strip() else None
 
 
 def _lines(path: Path) -> list[str]:
@@ -83,6 +83,8 @@ class BundleKeys:
             data = _decoded(line, len(_ALGORITHM) + _ID_BYTES + _KEY_BYTES)
             if data is None or not data.startswith(_ALGORITHM):
                 raise NafirError(f"{path}: line {number}: is no public key of minisign")
+            if data[2:10] in found:
+                raise NafirError(f"{path}: line {number}: key {_name(data[2:10])} is there twice: give it once")
             found[data[2:10]] = data[10:]
         if not 1 <= len(found) <= _MOST_KEYS:
             raise NafirError(f"{path}: has {len(found)} public keys: give 1 to {_MOST_KEYS}")
@@ -116,7 +118,7 @@ class Signature:
     @property
     def name(self) -> str:
         """The key's id as minisign shows it."""
-        return f"{int.from_bytes(self.key_id, 'little'):016X}"
+        return _name(self.key_id)
 
     @classmethod
     def parse(cls, lines: list[str]) -> Self:
@@ -167,7 +169,8 @@ class SigningKey:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a secret key as `nafir sign-bundle --new-key` and `minisign -G -W` write it: without a password. Raises
-        NafirError."""
+        NafirError, also for a damaged one: its seed has to fit the public half beside it and the checksum, where there
+        is one. Minisign writes none without a password."""
         lines = _lines(path)
         data = _decoded(lines[1], _SECRET_BYTES) if len(lines) == 2 and lines[0].startswith(_UNTRUSTED) else None
         if data is None or not data.startswith(_ALGORITHM):
@@ -175,7 +178,13 @@ class SigningKey:
         if data[2:4] != _NO_PASSWORD:
             raise NafirError(f"{path}: has a password: sign with minisign itself, `minisign -S -m scene.json`")
         at = len(_ALGORITHM + _NO_PASSWORD + _CHECKSUM) + _SALT_AND_LIMITS_BYTES
-        return cls(data[at : at + _ID_BYTES], data[at + _ID_BYTES : at + _ID_BYTES + _KEY_BYTES])
+        key = cls(data[at : at + _ID_BYTES], data[at + _ID_BYTES : at + _ID_BYTES + _KEY_BYTES])
+        kind = data[len(_ALGORITHM + _NO_PASSWORD) :][: len(_CHECKSUM)]
+        public, checksum = data[-2 * _KEY_BYTES : -_KEY_BYTES], data[-_KEY_BYTES:]
+        # guard: nothing is signed with a damaged key
+        if kind != _CHECKSUM or public != key.public or checksum not in {key._checksum, bytes(_KEY_BYTES)}:
+            raise NafirError(f"{path}: is damaged: take a copy of it, or make a new key with --new-key")
+        return key
 
     @property
     def _private(self) -> "Ed25519PrivateKey":
@@ -186,6 +195,10 @@ class SigningKey:
     def public(self) -> bytes:
         return self._private.public_key().public_bytes_raw()
 
+    @property
+    def _checksum(self) -> bytes:
+        return hashlib.blake2b(_ALGORITHM + self.id + self.seed + self.public, digest_size=_KEY_BYTES).digest()
+
     def sign(self, content: bytes, comment: str) -> Signature:
         """Raises NafirError for a comment that is no line."""
         if len(comment) > _LONGEST_COMMENT or not comment.isprintable():
@@ -195,15 +208,21 @@ class SigningKey:
 
     def write(self, path: Path) -> Path:
         """Write the key to a file that only its owner can read, and the public key beside it, to PATH.pub, which is
-        returned. Raises NafirError where there is a file already."""
+        returned. Raises NafirError where there is a file already; then neither is written."""
         public_path = path.with_name(f"{path.name}.pub")
-        public = self.public
-        checksum = hashlib.blake2b(_ALGORITHM + self.id + self.seed + public, digest_size=_KEY_BYTES).digest()
+        for each in (path, public_path):
+            if os.path.lexists(each):
+                raise NafirError(f"{each}: File exists")
+        public, checksum = self.public, self._checksum
         limits = bytes(_SALT_AND_LIMITS_BYTES)
         data = _ALGORITHM + _NO_PASSWORD + _CHECKSUM + limits + self.id + self.seed + public + checksum
         _write_new(path, f"{_UNTRUSTED}secret key for scene bundles\n{_text(data)}\n", mode=0o600)
         told = f"{_UNTRUSTED}public key for scene bundles\n{_text(_ALGORITHM + self.id + public)}\n"
-        _write_new(public_path, told, mode=0o644)
+        try:
+            _write_new(public_path, told, mode=0o644)
+        except NafirError:
+            path.unlink()
+            raise
         return public_path
 
 
@@ -216,7 +235,13 @@ def sign_bundle(folder: Path, key: SigningKey, comment: str) -> Path:
         manifest = (folder / MANIFEST_FILE).read_bytes()
         if hashlib.sha256(manifest).hexdigest() != bundle.digest:
             raise NafirError(f"{folder / MANIFEST_FILE}: changes while it is signed")
-        (path := folder / SIGNATURE_FILE).write_text(key.sign(manifest, comment).serialize())
+        path = folder / SIGNATURE_FILE
+        partial = path.with_name(f".{path.name}.partial")
+        try:
+            partial.write_text(key.sign(manifest, comment).serialize())
+            partial.replace(path)  # at once, so that a server that reads it meanwhile finds either
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as exc:
         raise NafirError(f"{folder}: {exc.strerror}") from exc
     return path
@@ -230,10 +255,19 @@ def _text(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
+def _name(key_id: bytes) -> str:
+    """A key's id as minisign shows it."""
+    return f"{int.from_bytes(key_id, 'little'):016X}"
+
+
 def _write_new(path: Path, text: str, *, mode: int) -> None:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(descriptor, "w") as file:
-            file.write(text)
+        try:
+            with os.fdopen(descriptor, "w") as file:
+                file.write(text)
+        except OSError:
+            path.unlink()
+            raise
     except OSError as exc:
         raise NafirError(f"{path}: {exc.strerror}") from exc

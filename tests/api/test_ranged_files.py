@@ -5,19 +5,21 @@ from starlette.applications import Starlette
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from server.api.ranged_files import RangedFile
+from server.api.ranged_files import RangedBytes, RangedFile
 from tests.api.test_routes import check_problem
 
 CONTENT = bytes(range(100))
 TAG = '"abc"'
 
 
-@pytest.fixture
-def ask(tmp_path):
+@pytest.fixture(params=["on disk", "in memory"])
+def ask(tmp_path, request):
     path = tmp_path / "a.bin"
     path.write_bytes(CONTENT)
 
     async def endpoint(_):
+        if request.param == "in memory":
+            return RangedBytes(CONTENT, headers={"ETag": TAG}, media_type="application/octet-stream")
         return RangedFile(path, headers={"ETag": TAG}, stat_result=path.stat())
 
     client = TestClient(Starlette(routes=[Route("/", endpoint, methods=["GET"])]))

@@ -283,6 +283,22 @@ def test_a_bundle_can_be_read_back_file_by_file(shared_client, bundle, tmp_path)
     assert Bundle.load(tmp_path).digest == bundle.digest
 
 
+def test_what_is_sent_of_a_bundle_is_what_was_checked(bundle_copy, hrtfs):
+    """Whoever changes a file later, or puts a link in its place, changes nothing of it."""
+    loaded = Bundle.load(bundle_copy)
+    secret = bundle_copy.parent / "secret"
+    secret.write_text("a secret")
+    with serving(FieldsByLevel.load(loaded), hrtfs) as client:
+        for name in (*loaded.manifest.files, "scene.json"):
+            (bundle_copy / name).unlink()
+        (bundle_copy / "arrays.npz").write_bytes(b"others")
+        (bundle_copy / "scene.json").symlink_to(secret)
+        for each in client.get("/v1/scenes/flat/bundle").json()["files"]:
+            answer = client.get(f"/v1/scenes/flat/bundle/{each['name']}")
+            assert hashlib.sha256(answer.content).hexdigest() == each["sha256"]
+            assert answer.headers["etag"].strip('"W/') in each["sha256"]
+
+
 def test_a_file_of_a_bundle_is_sent_once_and_in_parts(shared_client, bundle):
     path = "/v1/scenes/flat/bundle/arithmetic.onnx"
     answer = shared_client.get(path)

@@ -12,6 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from server.core.errors import BundleError, RequestError
+from server.scene import bundle as bundle_module
 from server.scene.bundle import BUNDLED, Bundle, bundled_scenes, find_bundle, write_bundle
 from server.scene.manifest import Manifest
 
@@ -44,6 +45,19 @@ def test_one_flipped_bit_is_found(bundle_copy, name):
     data[len(data) // 2] ^= 1
     (bundle_copy / name).write_bytes(data)
     with pytest.raises(BundleError, match=rf"{name}: sha256"):
+        Bundle.load(bundle_copy)
+
+
+def test_a_file_that_changes_between_its_check_and_its_reading_is_refused(bundle_copy, monkeypatch):
+    path, hash_of = bundle_copy / "arithmetic.onnx", bundle_module._hash_of
+
+    def checked_and_replaced(stream, most_bytes):
+        digest = hash_of(stream, most_bytes)
+        path.write_bytes(bytes(path.stat().st_size))
+        return digest
+
+    monkeypatch.setattr(bundle_module, "_hash_of", checked_and_replaced)
+    with pytest.raises(BundleError, match=r"arithmetic\.onnx: sha256: .*it changes meanwhile"):
         Bundle.load(bundle_copy)
 
 

@@ -1,7 +1,11 @@
 """Signatures of bundles: those of minisign itself fit, and nothing but what was signed does."""
 
+import base64
+import errno
+import os
 import shutil
 import stat
+import string
 
 import pytest
 
@@ -85,6 +89,19 @@ def test_every_bit_of_a_signature_counts(folder, key_file, keys):
     Bundle.load(folder, keys=keys)
 
 
+def test_a_signature_is_written_in_one_way_only(folder, key_file, keys):
+    """The last character has bits to spare."""
+    path = sign_bundle(folder, SigningKey.read(key_file), "")
+    line = path.read_text().splitlines()[1]
+    assert line[-1] == "="
+    alphabet = string.ascii_uppercase + string.ascii_lowercase + string.digits + "+/"
+    other = line[:-2] + alphabet[alphabet.index(line[-2]) + 1] + "="
+    assert base64.b64decode(other) == base64.b64decode(line)
+    written(path, path.read_text().replace(line, other))
+    with pytest.raises(BundleError, match="is no signature of minisign"):
+        Bundle.load(folder, keys=keys)
+
+
 def test_bundles_without_a_signature_or_by_another_key_are_refused(folder, keys):
     with pytest.raises(BundleError, match=r"scene.json.minisig: file: is missing: bundle_keys asks for signed"):
         load_scenes([folder], keys=keys)
@@ -116,6 +133,58 @@ def test_keys_are_written_once_and_for_their_owner_alone(key_file, keys):
         key.write(key_file)
 
 
+def test_half_a_key_is_never_left(tmp_path, monkeypatch):
+    key = SigningKey.new()
+    public = written(tmp_path / "key.pub", "of another key")
+    with pytest.raises(NafirError, match=r"key\.pub: File exists"):
+        key.write(tmp_path / "key")
+    assert [each.name for each in tmp_path.iterdir()] == ["key.pub"]
+    public.unlink()
+    opened = os.open
+
+    def on_a_full_disk(path, *rest):
+        if path == public:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return opened(path, *rest)
+
+    monkeypatch.setattr(os, "open", on_a_full_disk)
+    with pytest.raises(NafirError, match="No space left"):
+        key.write(tmp_path / "key")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_every_bit_of_a_secret_key_counts(key_file):
+    """But for salt and limits, which a key without a password does not use."""
+    comment, line = key_file.read_text().splitlines()
+    data = base64.b64decode(line)
+    for at in (*range(6), *range(54, len(data), 3)):
+        changed = bytearray(data)
+        changed[at] ^= 0x10
+        with pytest.raises(NafirError, match=r"is damaged|is no secret key|has a password"):
+            SigningKey.read(written(key_file, f"{comment}\n{base64.b64encode(changed).decode()}\n"))
+
+
+def test_a_secret_key_of_minisign_has_no_checksum(folder, key_file, keys):
+    comment, line = key_file.read_text().splitlines()
+    without = base64.b64encode(base64.b64decode(line)[:-32] + bytes(32)).decode()
+    sign_bundle(folder, SigningKey.read(written(key_file, f"{comment}\n{without}\n")), "")
+    Bundle.load(folder, keys=keys)
+
+
+def test_a_signature_takes_the_place_of_another_at_once(folder, key_file, keys, monkeypatch):
+    path = sign_bundle(folder, SigningKey.read(key_file), "first")
+
+    def fail(*_):
+        assert Bundle.load(folder, keys=keys)  # as it was until now
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(type(path), "replace", fail)
+    with pytest.raises(NafirError, match="No space left"):
+        sign_bundle(folder, SigningKey.read(key_file), "second")
+    assert "first" in path.read_text()
+    assert {each.name for each in folder.iterdir()} == {MANIFEST_FILE, SIGNATURE_FILE}
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -123,6 +192,7 @@ def test_keys_are_written_once_and_for_their_owner_alone(key_file, keys):
         ("untrusted comment: x\n", "has 0 public keys"),
         (f"{PUBLIC[:-4]}\n", "line 1: is no public key"),
         (f"# ours\n{PUBLIC}\nX{PUBLIC[1:]}\n", "line 3: is no public key"),
+        (f"# ours\n{PUBLIC}\n\n{PUBLIC}\n", "line 4: key E7620F1842B4E81F is there twice"),
         ("\0" * 20_000, "has more than"),
     ],
 )
