@@ -75,6 +75,7 @@ from server.protocol.client_messages import (
     SetEffects,
     SetLevel,
     emitter_of,
+    ids_named_by,
     listener_of,
     parse_client_message,
     require_protocol,
@@ -994,7 +995,7 @@ class Connection:
                 return False
             self._pass_on(message, self._stream)
         except RequestError as refusal:
-            self._refuse(refusal, message)
+            self._refuse(refusal, message or data)
         self._handled += _counts(message, data)
         return True
 
@@ -1011,7 +1012,7 @@ class Connection:
             else:
                 self._pass_on(message, stream)
         except RequestError as refusal:
-            self._refuse(refusal, message)
+            self._refuse(refusal, message or data)
         self._handled += _counts(message, data)
 
     async def _add_listener(self, message: AddListener, stream: Stream, hello: Hello) -> None:
@@ -1072,9 +1073,12 @@ class Connection:
         if self._block_encoding is not None:
             self._block_encoding.capacity = self._capacity
 
-    def _refuse(self, refusal: RequestError, message: ClientMessage | None) -> None:
-        """Tell the client that a message was refused; None stands for one that could not be read."""
-        about = (None, None) if message is None else (emitter_of(message), listener_of(message))
+    def _refuse(self, refusal: RequestError, message: ClientMessage | str | bytes) -> None:
+        """Tell the client that a message was refused, as it came if it could not be read."""
+        if isinstance(message, str | bytes):
+            about = ids_named_by(message)
+        else:
+            about = emitter_of(message), listener_of(message)
         self._enqueue([Error.from_refusal(refusal, *about)])
 
     def _pass_on(self, message: ClientMessage, stream: Stream) -> None:

@@ -432,6 +432,15 @@ _FIELDS: Final[Mapping[str, Iterable[str]]] = {
 _CLIENT: TypeAdapter[TextMessage] = TypeAdapter(Annotated[TextMessage, Field(discriminator="type")])
 
 
+_ID: TypeAdapter[str] = TypeAdapter(Annotated[str, Field(min_length=1, max_length=64)])
+_ID_KEYS: Final[Mapping[str, tuple[str | None, str | None]]] = {
+    **dict.fromkeys(("add_emitter", "move_emitter", "stop_emitter", "set_gain", "remove_emitter"), ("id", None)),
+    **dict.fromkeys(("add_listener", "remove_listener"), (None, "id")),
+    **dict.fromkeys(("listener", "acknowledge"), (None, "listener")),
+}
+"""Where messages of these types have the ids of the emitter and of the listener that they are about."""
+
+
 def emitter_of(message: ClientMessage) -> str | None:
     """The id of the emitter that a message is about; None if it is about none."""
     about_one = AddEmitter | MoveEmitter | StopEmitter | SetGain | RemoveEmitter | DryBlock | DryPackets
@@ -446,6 +455,21 @@ def listener_of(message: ClientMessage) -> str | None:
         case ListenerPose() | Acknowledge():
             return message.listener
     return None
+
+
+def ids_named_by(data: str | bytes) -> tuple[str | None, str | None]:
+    """The ids of the emitter and of the listener that a message is about which `parse_client_message` refuses, as
+    `emitter_of` and `listener_of` have them of others. None where the message has no such id that can be read."""
+    raw = {} if isinstance(data, bytes) else _object_in(data)
+    emitter_key, listener_key = _ID_KEYS.get(str(raw.get("type")), (None, None))
+    return _id_in(raw, emitter_key), _id_in(raw, listener_key)
+
+
+def _id_in(raw: Mapping[str, Any], key: str | None) -> str | None:
+    try:
+        return None if key is None else _ID.validate_python(raw.get(key), strict=True)
+    except ValidationError:
+        return None
 
 
 def parse_client_message(data: str | bytes) -> ClientMessage:
@@ -486,12 +510,8 @@ def _require_distinct_keys(data: str) -> None:
 
 def _require_version(data: str) -> None:
     """Raises RequestError for a hello or resume of another version, or without one."""
-    try:
-        # Python refuses to convert very long integers.
-        hello = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
-    except (ValueError, RecursionError):
-        return
-    if not isinstance(hello, dict) or hello.get("type") not in ("hello", "resume"):
+    hello = _object_in(data)
+    if hello.get("type") not in ("hello", "resume"):
         return
     version = hello.get("protocol")
     if isinstance(version, bool) or not isinstance(version, int | float) or version % 1 > 0:
@@ -500,6 +520,16 @@ def _require_version(data: str) -> None:
     if version != PROTOCOL:
         problem = f"this server speaks protocol {PROTOCOL}, not {version:g}"
         raise RequestError("unsupported_protocol", problem, field="protocol")
+
+
+def _object_in(data: str) -> dict[str, Any]:
+    """The JSON object of a message that may be none; empty where there is none."""
+    try:
+        # Python refuses to convert very long integers.
+        found = json.loads(data, parse_int=lambda digits: int(digits) if len(digits) < 20 else math.inf)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _refusal(error: ValidationError, *, is_tagged: bool) -> RequestError:

@@ -300,8 +300,8 @@ class Pong(Message):
 
 class Error(Message):
     """Says what was wrong with a message. The stream goes on, unless the message was the hello. `emitter` is the id of
-    the emitter that the message was about, if it was about one and could be read; `listener` that of a listener beside
-    the first.
+    the emitter that the message was about, if it was about one and its id could be read; `listener` that of a listener
+    beside the first.
 
     What a server refuses because it has too much to do (`server_busy`) may be asked for again after `retry_after_s`
     seconds. `level` is the quality level at which a stream that insists on another would fit now, if there is one.

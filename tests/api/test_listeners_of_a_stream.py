@@ -1,5 +1,6 @@
 """Several listeners of one stream, over a WebSocket of the whole application."""
 
+import json
 import time
 
 import numpy as np
@@ -257,3 +258,25 @@ def test_who_joins_hears_the_scene_in_which_the_stream_is(client, monkeypatch): 
         first, guest = (member.session._effects.planned for member in stream.audience.members)
         assert guest.place.reverberations is first.place.reverberations
         assert guest._costs(None) == first._costs(None)
+
+
+def test_a_refusal_of_what_cannot_be_read_names_whom_it_is_about(client):  # noqa: F811
+    malformed = [
+        ({"type": "add_listener", "id": "guest", "position": [None, 1, 1]}, "malformed_pose", None, "guest"),
+        ({"type": "add_listener", "id": "guest", "hrtf": 2, "position": NEAR}, "malformed_message", None, "guest"),
+        (
+            {"type": "add_emitter", "id": "talker", "position": NEAR, "gain_db": 900},
+            "malformed_message",
+            "talker",
+            None,
+        ),
+        ({"type": "set_effects", "effects": {"echo": "loud"}}, "malformed_message", None, None),
+        ({"type": "add_listener", "id": 65 * "x", "position": NEAR}, "malformed_message", None, None),
+    ]
+    with client.websocket_connect("/v1/stream") as socket:
+        party = Party(socket)
+        for message, *told in malformed:
+            socket.send_text(json.dumps(message))
+            error = party.until(Error)
+            assert [error.code, error.emitter, error.listener] == told
+        assert party.add("guest").index == 1

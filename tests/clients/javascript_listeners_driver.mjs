@@ -8,6 +8,16 @@ import { pathToFileURL } from "node:url";
 const { steps } = JSON.parse(readFileSync(0));
 const sockets = [];
 let log = [];
+const limits = new Set(); // long timers, which end when a step says so
+const startTimer = globalThis.setTimeout;
+const stopTimer = globalThis.clearTimeout;
+globalThis.setTimeout = (callback, ms) => {
+  if (ms < 20_000) return startTimer(callback, ms);
+  const limit = { callback };
+  limits.add(limit);
+  return limit;
+};
+globalThis.clearTimeout = (timer) => limits.delete(timer) || stopTimer(timer);
 
 globalThis.WebSocket = class {
   static OPEN = 1;
@@ -66,7 +76,14 @@ const acts = {
   add: (listener) => stream.addListener(listener),
   move: (listener) => stream.moveListener(listener),
   remove: (id) => stream.removeListener(id),
+  emitter: (emitter) => stream.setEmitter(emitter),
   pause,
+  expire() {
+    for (const limit of limits) {
+      limits.delete(limit);
+      limit.callback();
+    }
+  },
   async reconnect() {
     const before = sockets.length;
     while (sockets.length === before) await pause(5);

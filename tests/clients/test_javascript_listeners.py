@@ -10,11 +10,13 @@ import pytest
 from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import (
     Acknowledge,
+    AddEmitter,
     AddListener,
     Hello,
     ListenerPose,
     RemoveListener,
     Resume,
+    SetGain,
     parse_client_message,
 )
 from tests.clients.test_javascript import HERE, MODULES, NODE
@@ -189,3 +191,86 @@ def test_one_who_was_there_is_asked_for_again_when_a_full_server_says(tmp_path):
     assert [each for each in busy[1] if "left" in each] == []
     assert [each.id for each in of(AddListener, again)] == ["p2"]
     assert {"left": {"id": "p2", "code": "unknown_hrtf", "message": "no"}} in gone[1]
+
+
+LOST = [["lose", 1006], ["reconnect", None], ["open", None]]
+
+
+def emitter(identifier, gain_db=0):
+    return ["emitter", {"id": identifier, "live": True, "gainDb": gain_db, **at(2)}]
+
+
+def test_of_gains_in_an_outage_the_newest_is_said_and_counted(tmp_path):
+    fade = [emitter("e1", -gain / 10) for gain in range(1, 401)]
+    _, _, gone_on, _, again = run(
+        tmp_path,
+        [*OPENED, emitter("e1")],
+        [["lose", 1006], *fade, emitter("e2"), emitter("e2", -3), ["reconnect", None], ["open", None]],
+        [["receive", resumed(handled=1)], ["pause", SETTLED_MS]],
+        [["lose", 1006], emitter("e1", -50), ["reconnect", None], ["open", None]],
+        [["receive", resumed(handled=3)], ["pause", SETTLED_MS]],
+    )
+    assert [(each.id, each.gain_db) for each in of(SetGain, gone_on)] == [("e1", -40), ("e2", -3)]
+    assert [each.id for each in of(AddEmitter, gone_on)] == ["e2"]
+    # It had handled what adds e1, the gain of e1 and what adds e2: the gain of e2 and the new one of e1 are to be said.
+    assert [(each.id, each.gain_db) for each in of(SetGain, again)] == [("e2", -3), ("e1", -50)]
+    assert of(AddEmitter, again) == []
+
+
+def test_a_stream_of_which_too_much_is_unsaid_begins_anew(tmp_path):
+    comings = [each for _ in range(150) for each in (["add", {"id": "p2", **at(2)}], ["remove", "p2"])]
+    _, _, resumption, anew = run(
+        tmp_path,
+        OPENED,
+        [["lose", 1006], emitter("e1"), *comings],
+        [["reconnect", None], ["open", None], ["receive", resumed(handled=0)], ["pause", SETTLED_MS]],
+        [["open", None], ["receive", NEW], ["pause", SETTLED_MS]],
+    )
+    assert [type(each) for each in resumption[0]] == [Resume]
+    assert len(of(Hello, anew)) == 1
+    assert [each.id for each in of(AddEmitter, anew)] == ["e1"]
+    assert of(AddListener, anew) == []
+
+
+def test_a_stream_goes_on_after_many_orders_that_the_server_has(tmp_path):
+    fade = [emitter("e1", -gain / 10) for gain in range(1, 401)]
+    *_, gone_on = run(
+        tmp_path,
+        [*OPENED, emitter("e1"), *fade],
+        [*LOST, ["receive", resumed(handled=400)], ["pause", SETTLED_MS]],
+    )
+    assert of(Hello, gone_on) == []
+    assert [each.gain_db for each in of(SetGain, gone_on)] == [-40]
+
+
+def test_a_listener_of_whom_nothing_is_said_is_given_up(tmp_path):
+    _, _, asked, given_up, resumed_without, late = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        [["add", {"id": "p3", **at(3)}]],
+        [["expire", None]],
+        [*LOST, ["receive", resumed(handled=3, listeners=[{"id": "p2", "index": 1}])], ["pause", SETTLED_MS]],
+        [["receive", entered("p3", 2)], ["receive", block_of(2, 0, 0)], ["expire", None]],
+    )
+    assert [each.id for each in of(AddListener, asked)] == ["p3"]
+    assert given_up[1] == [{"left": {"id": "p3", "code": None, "message": "the listener was not there within 30 s"}}]
+    assert of(RemoveListener, given_up) == [RemoveListener(id="p3")]
+    assert of(AddListener, resumed_without) == []
+    assert late == ([], [])
+
+
+def test_an_old_server_refuses_a_listener_without_naming_it(tmp_path):
+    old = {"type": "error", "code": "unknown_message", "message": "no", "field": "type"}
+    other = {"type": "error", "code": "malformed_message", "message": "no", "field": "effects"}
+    _, _, told, refused = run(
+        tmp_path,
+        OPENED,
+        JOINED,
+        [["add", {"id": "p3", **at(3)}], ["receive", other], ["receive", refusal("unknown_listener", "p3")]],
+        [["receive", old], ["receive", block_of(1, 0, 0)]],
+    )
+    assert [each for each in told[1] if "left" in each] == []
+    assert [each["left"]["id"] for each in refused[1] if "left" in each] == ["p3"]
+    assert of(RemoveListener, refused) == [RemoveListener(id="p3")]
+    assert [each["block"]["id"] for each in refused[1] if "block" in each] == ["p2"]

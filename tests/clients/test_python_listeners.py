@@ -198,17 +198,29 @@ def test_a_listener_whom_a_resumed_stream_lacks_is_asked_for_unless_an_error_tel
     assert again.id == "asked"
     error = {"type": "error", "code": "unknown_hrtf", "message": "no", "field": "hrtf", "listener": "there"}
     session.receive(json.dumps(error), 0.0)
-    assert session.refused_listener(session.last_error) is there
-    assert session.refused_listener(RefusedError("x", "y", listener="asked")) is asked
+    assert session.take_refused_listener(session.last_error) is there
+    assert session.take_refused_listener(RefusedError("x", "y", listener="asked")) is asked
 
 
 def test_an_error_about_the_pose_of_a_listener_who_is_there_refuses_nobody():
     session = opened()
     added(session, "p2", 1)
-    assert session.refused_listener(RefusedError("position_out_of_bounds", "", listener="p2")) is None
+    assert session.take_refused_listener(RefusedError("position_out_of_bounds", "", listener="p2")) is None
     unheard = session.add_listener("p3", pose(), None)
-    assert session.refused_listener(RefusedError("unknown_clip", "", emitter="a")) is None
-    assert session.refused_listener(RefusedError("unknown_message", "of a server without them")) is unheard
+    assert session.take_refused_listener(RefusedError("unknown_clip", "", emitter="a")) is None
+    assert session.take_refused_listener(RefusedError("malformed_message", "of effects")) is None
+    assert session.take_refused_listener(RefusedError("unknown_listener", "of an earlier one", listener="p3")) is None
+    assert session.listeners["p3"] is unheard
+
+
+def test_one_whom_an_old_server_cannot_add_is_removed_if_it_does():
+    session = opened()
+    added(session, "p2", 1)
+    unheard = session.add_listener("p3", pose(), None)
+    drained(session.outbox)
+    assert session.take_refused_listener(RefusedError("unknown_message", "of a server without them")) is unheard
+    assert list(map(parse_client_message, drained(session.outbox))) == [RemoveListener(id="p3")]
+    assert list(session.listeners) == ["p2"]
 
 
 def test_a_path_as_heard_has_the_levels_of_its_own_listener():
@@ -274,11 +286,16 @@ def test_a_listener_that_is_refused_is_named_and_the_stream_goes_on(bundle, hrtf
             for place, wish in (
                 ((99, 0, 0), {"id": "p4"}),
                 (NEAR, {"id": "p5", "hrtf": "nobody"}),
-                (NEAR, {"id": "x" * 65}),
+                (NEAR, {"id": "p6", "hrtf": 2}),
             ):
                 with pytest.raises(RefusedError) as refused:
                     await stream.add_listener(place, **wish)
                 refusals.append((refused.value.code, refused.value.listener))
+            for identifier in ("", "x" * 65, 2, "\ud800"):
+                with pytest.raises(ValueError, match=r"id: has to be|surrogates not allowed"):
+                    await stream.add_listener(NEAR, id=identifier)
+                with pytest.raises(ValueError, match=r"id: has to be|surrogates not allowed"):
+                    await stream.add_emitter(id=identifier)
             third = await stream.add_listener(NEAR, id="p2")  # the id is free, and the place
             return refusals, *await asyncio.gather(blocks_of(stream, 10), blocks_of(third, 10))
 
@@ -291,10 +308,58 @@ def test_a_listener_that_is_refused_is_named_and_the_stream_goes_on(bundle, hrtf
         ("duplicate_listener", "p2"),
         ("position_out_of_bounds", "p4"),
         ("unknown_hrtf", "p5"),
-        ("malformed_message", None),
+        ("malformed_message", "p6"),
     ]
     assert (len(first), len(third)) == (10, 10)
     assert refused.value.field == "listeners"
+
+
+def test_a_refusal_of_something_else_refuses_nobody_who_waits(served):
+    async def listen():
+        async with connect(served) as stream:
+            told = []
+            stream._on_message = lambda message: told.append(message.get("code", message["type"]))
+            adding = asyncio.create_task(stream.add_listener(FAR))
+            emitting = asyncio.create_task(stream.add_emitter(clip="trumpet"))
+            await asyncio.sleep(0)
+            await stream.set_effects({"early_reflections": "loud"})
+            second, _ = await asyncio.gather(adding, emitting)
+            while "malformed_message" not in told:
+                await blocks_of(second, 1)
+            await second.remove()
+            while "listener_removed" not in told:
+                await blocks_of(stream, 1)
+            return told
+
+    told = running(listen())
+    assert {"listener_added", "emitter_added"} <= set(told)
+
+
+@pytest.mark.parametrize("kind", ["listener", "emitter"])
+def test_one_who_is_added_again_at_once_does_not_wait_for_ever(served, kind):
+    """The first is refused, and the second has its id before the first has taken its own traces away."""
+
+    async def listen():
+        async with connect(served) as stream, asyncio.timeout(10):
+            add = (
+                stream.add_listener
+                if kind == "listener"
+                else lambda at, **more: stream.add_emitter(position=at, **more)
+            )
+            held = stream._session.listeners if kind == "listener" else stream._session.emitters
+            first = asyncio.create_task(add((99, 0, 0), id="p2"))
+            await asyncio.sleep(0)
+            assert "p2" in held
+            while "p2" in held:
+                stream._has_message.clear()
+                await stream._has_message.wait()
+            second = await add(NEAR, id="p2")
+            with pytest.raises(RefusedError):
+                await first
+            return second.id, await blocks_of(stream, 5)
+
+    name, blocks = running(listen())
+    assert (name, len(blocks)) == ("p2", 5)
 
 
 async def blocks_of_hello(address):

@@ -240,6 +240,23 @@ def test_messages_that_are_lost_twice_are_sent_twice():
         assert [json.loads(each)["level"] for each in drained(session.outbox)] == list("abc"[handled:])
 
 
+def test_a_stream_of_which_too_much_is_unsaid_begins_anew():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.add_emitter({"id": "a", "position": (1.0, 2.0, 1.0), "live": True}, None)
+    for _ in range(1_000):
+        session.set_level("auto")
+        drained(session.outbox)
+    session.first_message()
+    with pytest.raises(RefusedError, match="begins anew") as refused:
+        session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=0), 0.0)
+    assert refused.value.is_passing
+    assert json.loads(session.first_message())["type"] == "hello"
+    session.greet(resumable(), 0.0)
+    assert [json.loads(message)["type"] for message in drained(session.outbox)] == ["add_emitter"]
+
+
 def test_where_no_stream_is_kept_a_hello_begins_anew():
     session = Session("flat", {})
     session.first_message()

@@ -56,6 +56,28 @@ def test_a_listener_begins_where_the_stream_says(served):
         assert stream.listener == Pose.of((2.0, 2.5, 1.5), yaw=np.pi / 2)
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_an_on_block_that_raises_ends_its_listener_and_leaves_no_thread(served, is_first):
+    def fall(block):
+        raise OSError(f"no room for {block.frames} frames")
+
+    stream = connect(served, on_block=fall if is_first else None)
+    stream.__enter__()
+    other = stream if is_first else stream.add_listener(on_block=fall)
+    ends_s = time.monotonic() + 10
+    while other.failure is None and time.monotonic() < ends_s:
+        time.sleep(0.01)
+    assert "no room for 256 frames" in str(other.failure)
+    assert isinstance(other.failure.__cause__, OSError)
+    if not is_first:
+        assert stream.failure is None
+        assert stream.add_listener(id=other.id).failure is None  # the server has the other no more
+    with pytest.raises(OSError, match="no room"):
+        stream.close()
+    assert not stream._thread.is_alive()
+    stream.close()
+
+
 def test_reading_never_waits_and_is_silent_without_a_stream(served):
     stream = connect(served)
     assert not stream.read(100).any()

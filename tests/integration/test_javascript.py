@@ -123,6 +123,16 @@ def test_each_listener_has_an_output_and_hears_from_its_own_place(page):
         ["RefusedError", "duplicate_listener", "listener-2"],
         ["RefusedError", "unknown_hrtf", "headless"],
     ]
+    impossible = page.evaluate("""async () => {
+      const said = ({ name, message }) => `${name}: ${message.split(":")[0]}`;
+      const ids = ["", 2, "x".repeat(65), "\\ud800"].map((id) => ({ id }));
+      const poses = [{ position: [NaN, 1, 1] }, { position: [1, 1] }, { orientation: [0, 0, 0, 0] }, { yaw: Infinity }];
+      return Promise.all([...ids, ...poses].map((options) => first.addListener(options).catch(said)));
+    }""")
+    assert impossible == ["RangeError: id"] * 4 + ["RangeError: position"] * 2 + [
+        "RangeError: orientation",
+        "RangeError: yaw",
+    ]
     page.evaluate("second.remove()")
     page.evaluate("window.nafir = first")
     assert page.evaluate("nafir.listeners.size") == 0

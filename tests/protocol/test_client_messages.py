@@ -19,6 +19,7 @@ from server.protocol.client_messages import (
     PROTOCOL,
     Acknowledge,
     AddEmitter,
+    AddListener,
     DirectivityPattern,
     Hello,
     ListenerPose,
@@ -26,9 +27,13 @@ from server.protocol.client_messages import (
     MoveEmitter,
     Ping,
     RemoveEmitter,
+    RemoveListener,
     SetGain,
     SetLevel,
     StopEmitter,
+    emitter_of,
+    ids_named_by,
+    listener_of,
     parse_client_message,
 )
 from server.protocol.opus import OpusOptions
@@ -444,3 +449,51 @@ def test_a_message_without_doubled_keys_is_read_once(monkeypatch):
     )
     pose = ListenerPose(pose_id=1, position=(1, 2, 3), orientation=(0, 0, 0, 1))
     assert parse_client_message(pose.model_dump_json(exclude_none=True)) == pose
+
+
+LONGEST = "x" * 64
+
+
+@pytest.mark.parametrize(
+    ("data", "named"),
+    [
+        ('{"type": "add_listener", "id": "p2", "position": [null, 1, 1]}', (None, "p2")),
+        (f'{{"type": "add_listener", "id": "{LONGEST}", "hrtf": 2}}', (None, LONGEST)),
+        ('{"type": "remove_listener", "id": "p2", "more": 1}', (None, "p2")),
+        ('{"type": "listener", "listener": "p2", "pose_id": 1, "position": [1, NaN, 1]}', (None, "p2")),
+        ('{"type": "listener", "pose_id": -1, "position": [1, 1, 1]}', (None, None)),
+        ('{"type": "acknowledge", "listener": "p2", "sequence": 1.5}', (None, "p2")),
+        (f'{{"type": "add_emitter", "id": "e", "clip": {"9" * 5_000}}}', ("e", None)),
+        ('{"type": "set_gain", "id": "e", "gain_db": 900}', ("e", None)),
+        (f'{{"type": "add_listener", "id": "{LONGEST}x"}}', (None, None)),
+        ('{"type": "add_listener", "id": ""}', (None, None)),
+        ('{"type": "add_listener", "id": 2}', (None, None)),
+        ('{"type": "add_listener", "id": "\\ud800"}', (None, None)),
+        ('{"type": "add_listener", "id": ["p2"]}', (None, None)),
+        ('{"type": ["add_listener"], "id": "p2"}', (None, None)),
+        ('{"type": "set_effects", "id": "p2", "effects": 1}', (None, None)),
+        ('{"type": "add_listener", "id": "p2"', (None, None)),
+        ("[" * 5_000, (None, None)),
+        ("null", (None, None)),
+        (b"\x02" * 35, (None, None)),
+    ],
+)
+def test_a_message_that_cannot_be_read_still_names_whom_it_is_about(data, named):
+    with pytest.raises(RequestError):
+        parse_client_message(data)
+    assert ids_named_by(data) == named
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        *CLIENT_MESSAGES,
+        AddListener(id="p2", position=(1, 1, 1)),
+        RemoveListener(id="p2"),
+        ListenerPose(pose_id=1, listener="p2", position=(1, 1, 1)),
+        Acknowledge(sequence=1, listener="p2"),
+    ],
+    ids=lambda message: message.type,
+)
+def test_the_same_ids_are_named_whether_a_message_can_be_read_or_not(message):
+    assert ids_named_by(message.serialize()) == (emitter_of(message), listener_of(message))

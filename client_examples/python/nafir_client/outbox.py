@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 Added = Literal["emitter", "listener"]
 _MOST_KEPT: Final = 1_000
-"""Counted messages that are kept. A server that had not handled older ones had closed the connection."""
+"""Counted messages that are kept."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,14 @@ class Outbox:
             self.put(message)
         self._waiting |= waiting
 
+    def can_resume(self, handled: int) -> bool:
+        """Whether all counted messages but the first so many are still there."""
+        return self._sent_count - handled <= len(self._sent)
+
     def resume(self, handled: int) -> None:
         """The server has handled so many counted messages of this stream. The others wait again, before all else."""
-        lost = min(max(0, self._sent_count - handled), len(self._sent))
+        assert self.can_resume(handled)
+        lost = max(0, self._sent_count - handled)
         again = [self._sent.pop() for _ in range(lost)][::-1]
         self._sent_count -= lost
         self.put_first(again)

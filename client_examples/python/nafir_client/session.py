@@ -37,11 +37,21 @@ Message = Mapping[str, Any]
 _ACKNOWLEDGE_EVERY = 4
 _UNCOUNTED = frozenset({"listener", "move_emitter", "acknowledge", "ping"})
 _TOKEN_UNKNOWN = "unknown_resume_token"
-_REFUSALS_OF_FORM = frozenset({"malformed_message", "malformed_pose", "malformed_directivity", "message_too_large"})
-"""Errors about messages that the server could not read, so that it cannot say which emitter or listener they were
-about."""
+_TOO_LARGE = "message_too_large"
+"""The error about a message that the server does not read, so that it cannot say which emitter it was about."""
 _NOT_KNOWN = "unknown_message"
 """The error of a server that is too old to have several listeners in a stream."""
+_NOT_THERE = "unknown_emitter", "unknown_listener"
+"""Errors about what is removed or changed, and never about what is added."""
+_LONGEST_ID = 64
+
+
+def require_id(identifier: str) -> str:
+    """The id of an emitter or listener. Raises ValueError for what no server takes."""
+    if not isinstance(identifier, str) or not 1 <= len(identifier) <= _LONGEST_ID:
+        raise ValueError(f"id: has to be 1 to {_LONGEST_ID} characters, not {identifier!r}")
+    identifier.encode()  # of a half of a pair of surrogates this says what is wrong
+    return identifier
 
 
 class StreamOptions(TypedDict, total=False):
@@ -220,12 +230,15 @@ class Session:
             raise error
         if answer["type"] != "welcome":
             raise ProtocolError(f"the server answers a first message with {answer['type']}")
+        resumed = answer.get("resumed")
+        if resumed is not None and not self.outbox.can_resume(resumed["handled"]):
+            self._resume_token = None
+            raise RefusedError(_TOKEN_UNKNOWN, "too much was said since to go on with the stream: it begins anew")
         is_first, self.welcome = self.welcome is None, Welcome.read(answer)
         self.level = self.welcome.level
         self.last_error = None
         self._pings.clear()
         self._resume_token = answer.get("resume_token")
-        resumed = answer.get("resumed")
         if resumed is not None:
             self._resume(resumed["pose_id"], resumed["handled"], resumed["sample_clock"], now_s)
             self._resume_listeners(resumed, now_s)
@@ -339,9 +352,23 @@ class Session:
             del self.listeners[listener.id]
             self._put({"type": "remove_listener", "id": listener.id})
 
-    def forget_listener(self, listener: SessionListener) -> None:
-        """The server has refused it."""
-        self.listeners.pop(listener.id, None)
+    def take_refused_listener(self, error: RefusedError) -> SessionListener | None:
+        """Forget the listener that was not added because of an error, and return it; None if the error was about
+        something else. One whom the error does not name is removed, since the server may be about to have it."""
+        listener = self._refused_listener(error)
+        if listener is not None and error.listener is None:
+            self.remove_listener(listener)
+        elif listener is not None:
+            del self.listeners[listener.id]
+        return listener
+
+    def _refused_listener(self, error: RefusedError) -> SessionListener | None:
+        if error.listener is not None:
+            listener = self.listeners.get(error.listener)
+            return None if listener is None or listener.is_there or error.code in _NOT_THERE else listener
+        if error.code != _NOT_KNOWN:
+            return None
+        return next((each for each in self.listeners.values() if not each.is_there), None)
 
     def add_emitter(self, fields: dict[str, Any], live: LiveInput | None) -> SessionEmitter:
         """Raises RefusedError duplicate_emitter."""
@@ -376,12 +403,17 @@ class Session:
         self._put({"type": "stop_emitter", "id": emitter.id, "fade_s": fade_s, **at})
 
     def remove_emitter(self, emitter: SessionEmitter) -> None:
-        if self.emitters.pop(emitter.id, None) is not None:
+        if self.emitters.get(emitter.id) is emitter:
+            del self.emitters[emitter.id]
             self._put({"type": "remove_emitter", "id": emitter.id})
 
-    def forget_emitter(self, emitter: SessionEmitter) -> None:
-        """The server has refused it."""
-        self.emitters.pop(emitter.id, None)
+    def forget_emitter(self, emitter: SessionEmitter, error: RefusedError) -> None:
+        """The server has refused it. One whom the error does not name is removed, since the server may be about to have
+        it."""
+        if error.emitter is None:
+            self.remove_emitter(emitter)
+        elif self.emitters.get(emitter.id) is emitter:
+            del self.emitters[emitter.id]
 
     def set_level(self, level: str) -> None:
         self._hello["level"] = level
@@ -551,19 +583,10 @@ class Session:
         """The emitter that was not added because of an error; None if the error was about something else."""
         if error.emitter is not None:
             emitter = self.emitters.get(error.emitter)
-            return None if emitter is None or emitter.is_heard else emitter
-        if error.code not in _REFUSALS_OF_FORM:
+            return None if emitter is None or emitter.is_heard or error.code in _NOT_THERE else emitter
+        if error.code != _TOO_LARGE:
             return None
         return next((each for each in self.emitters.values() if not each.is_heard), None)
-
-    def refused_listener(self, error: RefusedError) -> SessionListener | None:
-        """The listener that was not added because of an error; None if the error was about something else."""
-        if error.listener is not None:
-            listener = self.listeners.get(error.listener)
-            return None if listener is None or listener.is_there else listener
-        if error.code not in _REFUSALS_OF_FORM | {_NOT_KNOWN}:
-            return None
-        return next((each for each in self.listeners.values() if not each.is_there), None)
 
 
 def _pose_fields(pose: Pose) -> dict[str, Any]:

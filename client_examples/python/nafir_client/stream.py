@@ -45,6 +45,7 @@ from nafir_client.session import (
     SessionListener,
     StreamOptions,
     refusal,
+    require_id,
 )
 from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
 from nafir_client.wire import Block
@@ -227,6 +228,10 @@ class Listener:
         """Take it out of the stream. Its blocks that have arrived can still be taken."""
         await self._stream.remove_listener(self._state, self._arrivals)
 
+    async def fail(self, failure: NafirClientError) -> None:
+        """Take it out of the stream because nobody takes its blocks any more: `failure` says why."""
+        await self._stream.remove_listener(self._state, self._arrivals, failure)
+
 
 class Stream:
     """One scene and its first listener, for as long as it is open. Iterating takes the first listener's blocks."""
@@ -349,7 +354,7 @@ class Stream:
 
     async def add_emitter(self, **options: Unpack[EmitterOptions]) -> Emitter:
         """Add an emitter and return once it is heard. Raises RefusedError, or another NafirClientError if the stream
-        ends first."""
+        ends first, and ValueError for an id or numbers that no server takes."""
         fields, live = self._emitter_fields(options)
         added = asyncio.get_running_loop().create_future()
         state = await self.change(lambda session: session.add_emitter(fields, live))
@@ -361,7 +366,7 @@ class Stream:
             self._has_outgoing.set()
             raise
         finally:
-            self._adding.pop(state.id, None)
+            _drop(self._adding, state.id, added)
         return Emitter(self, state)
 
     async def add_listener(
@@ -379,14 +384,14 @@ class Stream:
 
         Raises RefusedError if the server does not take it, with its id as `listener`: too_many_listeners, server_busy,
         position_out_of_bounds, unknown_hrtf and others. The stream then goes on as it was. Raises another
-        NafirClientError if the stream ends first, and ValueError for numbers that are no pose.
+        NafirClientError if the stream ends first, and ValueError for an id or numbers that no server takes.
         """
         if position is None:
             start = self.scene.listener
             position = start.position
             yaw = start.yaw if yaw is None and orientation is None else yaw
         pose = Pose.of(position, yaw=yaw, orientation=orientation)
-        identifier = id or self._free_id("listener", self._session.listeners)
+        identifier = self._free_id("listener", self._session.listeners) if id is None else require_id(id)
         state = await self.change(lambda session: session.add_listener(identifier, pose, hrtf))
         joining = self._joining[identifier] = asyncio.get_running_loop().create_future()
         arrivals = self._arrivals_of[identifier] = Arrivals()
@@ -395,10 +400,10 @@ class Stream:
         except BaseException:
             self._session.remove_listener(state)
             self._has_outgoing.set()
-            self._arrivals_of.pop(identifier, None)
+            _drop(self._arrivals_of, identifier, arrivals)
             raise
         finally:
-            self._joining.pop(identifier, None)
+            _drop(self._joining, identifier, joining)
         return Listener(self, state, arrivals)
 
     async def move_added_listener(self, state: SessionListener, pose: Pose, arrivals: Arrivals) -> int:
@@ -406,16 +411,19 @@ class Stream:
             raise arrivals.failure
         return await self.change(lambda session: session.move_added_listener(state, pose, time.monotonic()))
 
-    async def remove_listener(self, state: SessionListener, arrivals: Arrivals) -> None:
+    async def remove_listener(
+        self, state: SessionListener, arrivals: Arrivals, failure: NafirClientError | None = None
+    ) -> None:
+        """It ends with `failure`, or as one that was removed."""
         if arrivals.failure is not None:
             return
         await self.change(lambda session: session.remove_listener(state))
-        self._end_listener(state.id, ClosedError(f"listener {state.id!r} was removed"))
+        _drop(self._arrivals_of, state.id, arrivals)
+        arrivals.end(failure or ClosedError(f"listener {state.id!r} was removed"))
 
-    def _end_listener(self, identifier: str, failure: NafirClientError) -> None:
-        arrivals = self._arrivals_of.pop(identifier, None)
-        if arrivals is not None:
-            arrivals.end(failure)
+    async def fail(self, failure: NafirClientError) -> None:
+        """Nobody takes the blocks of the first listener any more, because of `failure`."""
+        self._arrivals.end(failure)
 
     async def wait_until_ended(self, state: SessionEmitter) -> None:
         while not state.has_ended:
@@ -476,10 +484,9 @@ class Stream:
         """The fields of an `add_emitter`, and where samples wait if it is live."""
         yaw, orientation = options.get("yaw"), options.get("orientation")
         pose = Pose.of(options.get("position", self.scene.emitter.position), yaw=yaw, orientation=orientation)
-        fields: dict[str, Any] = {
-            "id": options.get("id") or self._free_id("emitter", self._session.emitters),
-            "position": pose.position,
-        }
+        given = options.get("id")
+        identifier = self._free_id("emitter", self._session.emitters) if given is None else require_id(given)
+        fields: dict[str, Any] = {"id": identifier, "position": pose.position}
         if yaw is not None or orientation is not None:
             fields["orientation"] = pose.orientation
         if "gain_db" in options:
@@ -637,15 +644,16 @@ class Stream:
         state = self._session.refused_emitter(error)
         added = None if state is None else self._adding.get(state.id)
         if state is not None and added is not None and not added.done():
-            self._session.forget_emitter(state)
+            self._session.forget_emitter(state, error)
             added.set_exception(error)
-        if state is not None or (listener := self._session.refused_listener(error)) is None:
+        if state is not None or (listener := self._session.take_refused_listener(error)) is None:
             return
-        self._session.forget_listener(listener)
         joining = self._joining.get(listener.id)
         if joining is not None and not joining.done():
             joining.set_exception(error)
-        self._end_listener(listener.id, error)
+        arrivals = self._arrivals_of.pop(listener.id, None)
+        if arrivals is not None:
+            arrivals.end(error)
 
     def _pump(self) -> None:
         self._session.pump()
@@ -671,6 +679,12 @@ class Stream:
 def _fulfil(wait: "asyncio.Future[None] | None") -> None:
     if wait is not None and not wait.done():
         wait.set_result(None)
+
+
+def _drop(entries: dict[str, T], identifier: str, own: T) -> None:
+    """Take one's own entry away. By now there may be that of another with the same id."""
+    if entries.get(identifier) is own:
+        del entries[identifier]
 
 
 def _live(state: SessionEmitter) -> LiveInput:

@@ -11,7 +11,7 @@ stream (`add_listener`) are read for themselves.
 import asyncio
 import contextlib
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -56,7 +56,8 @@ def connect(
       heard with the next `read`, without a way over the network;
     - `on_block`: gets every block as it arrives, to record it, say.
 
-    `on_message` and `on_block` are called in the stream's thread and have to be quick.
+    `on_message` and `on_block` are called in the stream's thread and have to be quick. Where `on_block` raises, nothing
+    more is read, `failure` says why, and `close` raises the same.
     """
     stream = in_asyncio.connect(
         url,
@@ -228,15 +229,18 @@ class ThreadedStream:
         self.close()
 
     def close(self) -> None:
-        """End the stream and its thread."""
+        """End the stream and its thread. Raises what an `on_block` has raised."""
         if not self._thread.is_alive():
             return
-        self._run(self._stream.close(), _CALL_S)
-        for playing in tuple(self._playing):
-            playing.result(_CALL_S)
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        try:
+            self._run(self._stream.close(), _CALL_S)
+            for playing in tuple(self._playing):
+                playing.result(_CALL_S)
+        finally:
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join(_CALL_S)
+            if not self._thread.is_alive():  # else a callback does not return
+                self._loop.close()
 
     @property
     def welcome(self) -> Welcome:
@@ -395,15 +399,27 @@ class ThreadedStream:
             filters = self._client.head_filters(head, order=order, sample_rate=welcome.sample_rate)
         return Playout(welcome, output_rate=output_rate, filters=filters)
 
-    def _play(self, blocks: AsyncIterator[Block], playout: Playout, on_block: Callable[[Block], None] | None) -> None:
+    def _play(
+        self,
+        listener: in_asyncio.Stream | in_asyncio.Listener,
+        playout: Playout,
+        on_block: Callable[[Block], None] | None,
+    ) -> None:
         """Have the stream's thread hand the blocks of a listener on as they arrive."""
 
         async def play() -> None:
             with contextlib.suppress(NafirClientError):  # which is the `failure`
-                async for block in blocks:
+                async for block in listener:
                     playout.push(block)
-                    if on_block is not None:
+                    if on_block is None:
+                        continue
+                    try:
                         on_block(block)
+                    except Exception as exc:
+                        failure = NafirClientError(f"on_block failed: {exc!r}")
+                        failure.__cause__ = exc
+                        await listener.fail(failure)
+                        raise
 
         playing = asyncio.run_coroutine_threadsafe(play(), self._loop)
         self._playing.add(playing)

@@ -142,7 +142,8 @@ export interface Nafir extends EventTarget {
   readonly emitters: ReadonlyMap<string, Emitter>;
   addEmitter(options: EmitterOptions): Emitter;
   removeEmitter(id: string): void;
-  /** Adds a listener who hears the same emitters at the same time. Rejects with RefusedError if the server does not take it; the stream goes on. */
+  /** Adds a listener who hears the same emitters at the same time. Rejects with RefusedError if the server does not take it or it is not there within
+      30 s, and with RangeError for an id or numbers that no server takes; the stream goes on. */
   addListener(options?: ListenerOptions): Promise<Listener>;
   removeListener(id: string): void;
   /** Chooses a quality level of the scene, or "auto". */

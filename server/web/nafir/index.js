@@ -31,6 +31,21 @@ export class RefusedError extends Error {
   }
 }
 
+const LONGEST_ID = 64; // characters, as the server counts them
+
+/** Throws RangeError for what no server takes as the id or the pose of a listener. */
+function requireListener(id, { position, orientation, yaw = 0 }) {
+  if (typeof id !== "string" || id === "" || [...id].length > LONGEST_ID || /\p{Surrogate}/u.test(id)) {
+    throw new RangeError(`id: has to be 1 to ${LONGEST_ID} characters, not ${JSON.stringify(id)}`);
+  }
+  const areNumbers = (given, count) => given?.length === count && [...given].every(Number.isFinite);
+  if (position !== undefined && !areNumbers(position, 3)) throw new RangeError(`position: has to be 3 numbers, not ${position}`);
+  if (orientation !== undefined && !(areNumbers(orientation, 4) && orientation.some((each) => each !== 0))) {
+    throw new RangeError(`orientation: has to be 4 numbers that are not all 0, not ${orientation}`);
+  }
+  if (!Number.isFinite(yaw)) throw new RangeError(`yaw: has to be a number, not ${yaw}`);
+}
+
 /** What one listener hears: its Output, and how long poses take to be heard there. */
 class Hearing {
   #direct = new PoseLedger();
@@ -279,11 +294,13 @@ class Nafir extends EventTarget {
   /**
    * Adds a listener who hears the same emitters at the same time, and resolves once it is there: a Listener with an `output` of its own.
    * Options: `position` and `yaw` or `orientation` (without a position, where a visit of the scene begins), `head`, and an `id`. Rejects with
-   * RefusedError if the server does not take it (too_many_listeners, server_busy, position_out_of_bounds, unknown_hrtf); the stream goes on.
+   * RefusedError if the server does not take it (too_many_listeners, server_busy, position_out_of_bounds, unknown_hrtf) or it is not there
+   * within 30 s (its code is null then), and with RangeError for an id or numbers that no server takes; the stream goes on.
    */
   async addListener({ id = `listener-${++this.#listenerCount}`, head, ...pose } = {}) {
     const { order, rendered } = this.#options;
     if (rendered === "here") throw new RefusedError("a scene that is rendered here has one listener", "too_many_listeners", id);
+    requireListener(id, pose);
     if (this.#others.has(id)) throw new RefusedError(`there is a listener ${id} already`, "duplicate_listener", id);
     if (this.state === "closed") throw new RefusedError("the stream is closed", null, id);
     const { position, yaw } = this.welcome.scene.listener;

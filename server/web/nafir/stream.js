@@ -19,6 +19,9 @@ const TAKEN_OVER = 4409; // another connection has resumed the stream
 const ENDED = 1000; // for good
 const LOST = 4000; // a connection that is given up, whose stream is to be kept
 const FORGOTTEN = "unknown_resume_token";
+const NOT_KNOWN = "unknown_message"; // said by a server that is too old to have several listeners in a stream
+const NOT_THERE = "unknown_listener"; // said of one that is removed, moved or acknowledged, not of one that is added
+const ANSWER_MS = 30_000; // a listener that is not there for so long after it was asked for is given up
 const MOST_ORDERS = 256;
 const NEEDS_KEY = 401;
 const BUSY = 503;
@@ -58,7 +61,7 @@ export class Stream {
   #resumeMs = 0; // for so long after the connection was lost
   #lostAt = null; // when the connection of a stream to be resumed was lost
   #last = {}; // {sequence, sampleClock} of the last block
-  #orders = []; // the newest messages that the server counts, and how many there were
+  #orders = []; // the newest messages that the server counts: {text, key, isSent}, and how many there were
   #ordered = 0;
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
@@ -73,7 +76,7 @@ export class Stream {
    * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block, id), state({state, ...}),
    * posed({poseId, at, listener}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}),
    * joined({id}) and left({id, code, message}). `id` and `listener` are those of a listener beside the first: `joined` says that its blocks
-   * begin, in each new stream, and `left` that it was refused and is not asked for again.
+   * begin, in each new stream, and `left` that it was refused, or was not there in time (its code is null then), and is not asked for again.
    */
   constructor({ url, key = null, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -102,7 +105,7 @@ export class Stream {
       this.#endWriter(id);
       this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
-      this.#order(message.setGain(emitter));
+      this.#order(message.setGain(emitter), `gain ${id}`);
     } else {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();
@@ -111,7 +114,8 @@ export class Stream {
 
   /** Adds a listener beside the first, who hears the same emitters: {id, position, orientation, head, at}. */
   addListener({ id, ...listener }) {
-    this.#others.set(id, { ...listener, number: null, opus: null, asked: null, hasBeen: false });
+    const limit = setTimeout(() => this.#giveUp(id), ANSWER_MS);
+    this.#others.set(id, { ...listener, number: null, opus: null, asked: null, hasBeen: false, limit });
     if (this.#isOpen) this.#askFor(id);
   }
 
@@ -127,6 +131,11 @@ export class Stream {
   removeListener(id) {
     if (!this.#drop(id) || !this.#isOpen) return;
     this.#order(message.removeListener(id));
+  }
+
+  #giveUp(id) {
+    this.removeListener(id);
+    this.#listeners.left({ id, code: null, message: `the listener was not there within ${ANSWER_MS / 1000} s` });
   }
 
   /** Sends the next mono samples of a live emitter, in Opus where the stream is and the browser can, else as samples: in single precision
@@ -186,7 +195,7 @@ export class Stream {
 
   setLevel(level) {
     this.#hello = { ...this.#hello, level };
-    if (this.#isOpen) this.#order(message.setLevel(level));
+    if (this.#isOpen) this.#order(message.setLevel(level), "level");
   }
 
   /** Each of `effects` is on, off, or null to follow the plan; `output` is null to keep the present one. */
@@ -200,6 +209,10 @@ export class Stream {
   /** Begins a new stream, since only a hello says what `changes` say: the head, or the channels of the output. */
   renew(changes) {
     this.#hello = { ...this.#hello, ...changes };
+    this.#beginAnew();
+  }
+
+  #beginAnew() {
     clearTimeout(this.#retry);
     this.#detach(ENDED);
     this.#forget();
@@ -210,6 +223,7 @@ export class Stream {
   close() {
     clearTimeout(this.#retry);
     clearTimeout(this.#sending);
+    for (const { limit } of this.#others.values()) clearTimeout(limit);
     this.#detach(ENDED);
     this.#forget();
     this.#listeners.state({ state: "closed" });
@@ -233,7 +247,9 @@ export class Stream {
 
   /** Forgets a listener beside the first. Returns whether it was known. */
   #drop(id) {
-    this.#others.get(id)?.opus?.close();
+    const other = this.#others.get(id);
+    other?.opus?.close();
+    clearTimeout(other?.limit);
     this.#dirty.delete(`listener ${id}`);
     return this.#others.delete(id);
   }
@@ -243,6 +259,7 @@ export class Stream {
     const other = this.#others.get(id);
     if (!other) return; // removed meanwhile
     other.opus?.close();
+    clearTimeout(other.limit);
     Object.assign(other, { number, hasBeen: true, opus: this.#newOpus(id) });
     this.#dirty.add(`listener ${id}`); // where it is by now
     this.#schedule();
@@ -252,11 +269,20 @@ export class Stream {
       when; any other one is not. */
   #refusedListener({ listener: id, code, message: said, retry_after_s: retryS }) {
     const other = this.#others.get(id);
-    if (!other || other.number !== null) return;
+    if (!other || other.number !== null || code === NOT_THERE) return;
     other.asked = null;
     if (other.hasBeen && retryS) return;
     this.#drop(id);
     this.#listeners.left({ id, code, message: said });
+  }
+
+  /** Takes an error that may be about a listener whom an old server does not know how to add. Had it been about something else, the server
+      would have that listener. */
+  #refusedUnnamed(error) {
+    const [id] = [...this.#others].find(([, { number, asked }]) => number === null && asked !== null) ?? [];
+    if (id === undefined) return;
+    this.#refusedListener({ ...error, listener: id });
+    this.#order(message.removeListener(id));
   }
 
   /** Whether there is a stream that messages are for: one with a connection, or one to be resumed. */
@@ -264,9 +290,14 @@ export class Stream {
     return this.#welcomed || this.#token !== null;
   }
 
-  /** Sends a message that changes the stream, now or when it is resumed. */
-  #order(text) {
-    this.#orders.push(text);
+  /** Sends a message that changes the stream, now or when it is resumed. One that waits for that gives way to a newer one with its key. */
+  #order(text, key = null) {
+    const older = key === null ? -1 : this.#orders.findIndex((order) => order.key === key && !order.isSent);
+    if (older >= 0) {
+      this.#orders.splice(older, 1);
+      this.#ordered -= 1;
+    }
+    this.#orders.push({ text, key, isSent: this.#welcomed });
     this.#ordered += 1;
     if (this.#orders.length > MOST_ORDERS) this.#orders.shift();
     if (this.#welcomed) this.#send(text);
@@ -387,6 +418,7 @@ export class Stream {
         this.#asking = setTimeout(() => this.#askAgain(), comeBackMs);
       }
       if (received.listener) this.#refusedListener(received);
+      else if (received.code === NOT_KNOWN) this.#refusedUnnamed(received);
       this.#listeners.refused(received);
     }
   }
@@ -402,6 +434,10 @@ export class Stream {
   }
 
   #welcome(welcome) {
+    if (welcome.resumed && welcome.resumed.handled < this.#ordered - this.#orders.length) {
+      this.#beginAnew(); // some of what was said is gone, and only a hello says it all
+      return;
+    }
     this.#welcomed = true;
     this.#encoding = welcome.encoding;
     // A browser that fails at Opus gets samples.
@@ -435,12 +471,15 @@ export class Stream {
   /** Sends what the server had not got when the connection was lost, and where everything is now. */
   #goOn({ handled, listeners = [] }) {
     const missed = Math.max(0, this.#ordered - handled);
-    const lost = this.#orders.slice(Math.max(0, this.#orders.length - missed));
-    for (const text of lost) this.#send(text);
+    const lost = this.#orders.slice(this.#orders.length - missed);
+    for (const order of lost) {
+      this.#send(order.text);
+      order.isSent = true;
+    }
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
     const numbers = new Map(listeners.map(({ id, index }) => [id, index]));
     for (const [id, other] of this.#others) {
-      if (lost.includes(other.asked)) continue; // the server is yet to have it
+      if (lost.some(({ text }) => text === other.asked)) continue; // the server is yet to have it
       if (!numbers.has(id)) {
         const wasThere = other.number !== null;
         other.number = null;
