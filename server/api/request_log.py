@@ -25,6 +25,8 @@ REQUEST_ID: Final = "X-Request-ID"
 _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _QUIET: Final = frozenset({"/livez", "/readyz", "/metrics", "/metrics/process", "/streams/process"})
 """Paths that are asked for every few seconds, or by another process: only what goes wrong with them is written."""
+_LONGEST_PATH: Final = 256
+"""Characters of a path that are written."""
 _CLIENT_CLOSED_REQUEST = 499
 _REFUSED: Final = ("401", "403", "429")
 """Statuses of refusals that are counted: those that depend on who asks, and not on what is asked."""
@@ -117,13 +119,17 @@ class RequestLog:
                     "request",
                     extra={
                         "method": method,
-                        "path": scope["path"],  # without the query, in which people put keys
+                        "path": _shown(scope["path"]),  # without the query, in which people put keys
                         "status": _CLIENT_CLOSED_REQUEST if status is None else status,
                         **({} if code is None else {"code": code}),
                         "duration_ms": round(1000 * (self._time_s() - started_s), 1),
                         "client": scope["client"][0] if scope.get("client") else None,
                     },
                 )
+
+
+def _shown(path: str) -> str:
+    return path if len(path) <= _LONGEST_PATH else f"{path[:_LONGEST_PATH]}…"
 
 
 def _code_of(document: bytes) -> str | None:

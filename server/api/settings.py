@@ -105,8 +105,8 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """The least important lines that are written."""
     log_lines_per_min: Annotated[int, Field(ge=0)] = 600
-    """Lines of the log that may say the same for the same reason in a minute, by each process; then it says how many
-    were left out. 0 sets no limit."""
+    """Lines of the log that may say the same for the same reason in a minute, by each process; all below warnings
+    together may be five times as many. Then it says how many were left out. 0 sets no limit."""
     traces_url: str | None = None
     """Where OpenTelemetry traces go, by OTLP over HTTP, such as http://127.0.0.1:4318/v1/traces. They need the extra
     `otel`."""

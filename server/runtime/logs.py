@@ -3,8 +3,8 @@
 Modules log through the standard library; what belongs to a line besides its text goes into `extra`. structlog only
 writes the lines: with a time, the level, and what `about` has bound for the request or stream at hand.
 
-Clients cannot fill a disk: of lines that say the same for the same reason, `BoundedHandler` writes so many in a minute,
-and then how many it has left out.
+Clients make a log grow no faster than it can be rotated: of lines that say the same for the same reason, and of all
+lines together, `BoundedHandler` writes so many in a minute, and then how many it has left out.
 
 Keys and tokens never come into a log. No module logs them; and if one did, or a library does, `hide` blots them out of
 the finished line, tracebacks included.
@@ -40,8 +40,13 @@ _REASON: Final = ("status", "code", "reason")
 """Fields of a line that say why it is written."""
 _WINDOW_S: Final = 60.0
 _MOST_KINDS: Final = 256
-"""Kinds of lines that are counted apart from each other; all others count as one."""
+"""Kinds of lines that are counted apart from each other."""
+_MOST_TOGETHER: Final = 5
+"""Times as many lines of all kinds together as of one."""
 LEFT_OUT: Final = "lines left out"
+OF_SEVERAL_KINDS: Final = "of several kinds"
+_TOGETHER: Final = ()
+"""Stands for all kinds."""
 
 
 def hide(text: str) -> str:
@@ -85,17 +90,23 @@ def formatter(form: Form, *, colors: bool = False) -> logging.Formatter:
 
 @dataclass
 class _Window:
-    """Lines of one kind since `began_s`: how many came, and what to say of those that were not written."""
+    """Lines of one kind since `began_s`: how many came, and what to say of those that were not written, which are all
+    but the first `most`."""
 
     began_s: float
+    most: int
     lines: int = 0
     summary: logging.LogRecord | None = None
 
 
 class BoundedHandler(logging.StreamHandler[TextIO]):
-    """Writes at most so many lines of a kind in a minute; 0 sets no limit. Lines are of a kind if they say the same
-    (before their values are filled in) with the same status, code and reason. How many were left out is said with the
-    first line of any kind after that minute, and when the handler is closed."""
+    """Writes at most so many lines of a kind in a minute, and of all kinds together five times as many; with 0, all.
+    Lines are of a kind if they say the same (before their values are filled in) with the same status, code and reason.
+    How many were left out is said with the first line of any kind after that minute, and when the handler is closed.
+
+    Clients cause few kinds of warnings and errors, so these do not count together, and no flood of other lines hides
+    them. Beyond 256 kinds in a minute, errors are written, and all other lines count together.
+    """
 
     def __init__(self, stream: TextIO, *, most_per_min: int, time_s: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
@@ -122,15 +133,23 @@ class BoundedHandler(logging.StreamHandler[TextIO]):
     def _is_written(self, record: logging.LogRecord, now_s: float) -> bool:
         kind = (record.name, str(record.msg), *(getattr(record, name, None) for name in _REASON))
         if kind not in self._windows and len(self._windows) >= _MOST_KINDS:
-            kind = ()
+            self._tell(now_s)  # and forget what came earlier
+        if kind not in self._windows and len(self._windows) >= _MOST_KINDS:
+            return record.levelno >= logging.ERROR or self._has_room(_TOGETHER, record, now_s)
+        if not self._has_room(kind, record, now_s):
+            return False
+        return record.levelno >= logging.WARNING or self._has_room(_TOGETHER, record, now_s)
+
+    def _has_room(self, kind: tuple[object, ...], record: logging.LogRecord, now_s: float) -> bool:
         window = self._windows.get(kind)
         if window is None or now_s >= window.began_s + _WINDOW_S:
-            window = self._windows[kind] = _Window(now_s)
+            most = self._most if kind else _MOST_TOGETHER * self._most
+            window = self._windows[kind] = _Window(now_s, most)
         window.lines += 1
-        if window.lines <= self._most:
+        if window.lines <= window.most:
             return True
         if window.summary is None:
-            window.summary = _summary_of(record)
+            window.summary = _summary_of(record) if kind else _summary_of_several()
             end_s = window.began_s + _WINDOW_S
             self._due_s = end_s if self._due_s is None else min(self._due_s, end_s)
         return False
@@ -142,7 +161,7 @@ class BoundedHandler(logging.StreamHandler[TextIO]):
                 continue
             del self._windows[kind]
             if window.summary is not None:
-                window.summary.__dict__["lines"] = window.lines - self._most
+                window.summary.__dict__["lines"] = window.lines - window.most
                 # Without what the task at hand is about.
                 contextvars.Context().run(super().emit, window.summary)
         lacking = [each.began_s + _WINDOW_S for each in self._windows.values() if each.summary is not None]
@@ -154,6 +173,11 @@ def _summary_of(record: logging.LogRecord) -> logging.LogRecord:
     said = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": LEFT_OUT}
     why = {name: getattr(record, name) for name in _REASON if getattr(record, name, None) is not None}
     return logging.makeLogRecord({**said, "line": str(record.msg), **why})
+
+
+def _summary_of_several() -> logging.LogRecord:
+    said = {"name": __name__, "levelno": logging.WARNING, "levelname": "WARNING", "msg": LEFT_OUT}
+    return logging.makeLogRecord({**said, "line": OF_SEVERAL_KINDS})
 
 
 def configure_logs(form: Form, level: str, *, lines_per_min: int = 0, stream: TextIO | None = None) -> None:

@@ -90,6 +90,12 @@ def test_every_request_has_a_line_without_its_query(client, logged):
     assert logged()[0][2:4] == (500, "internal_error")
 
 
+def test_of_a_long_path_the_beginning_is_written(client, logged):
+    for length in (256, 257, 8_000):
+        client.get("/" + "x" * (length - 1))
+    assert [line[1] for line in logged()] == ["/" + "x" * 255, *["/" + "x" * 255 + "…"] * 2]
+
+
 def test_what_is_asked_all_the_time_has_lines_only_if_it_fails(client, logged):
     client.get("/livez")
     assert client.put("/streams/process").status_code == 204

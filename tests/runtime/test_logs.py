@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from server.api.api_keys import random_key
-from server.runtime.logs import LEFT_OUT, BoundedHandler, about, begin_about, configure_logs, formatter, hide
+from server.runtime.logs import (
+    LEFT_OUT,
+    OF_SEVERAL_KINDS,
+    BoundedHandler,
+    about,
+    begin_about,
+    configure_logs,
+    formatter,
+    hide,
+)
 from tests.api.token_keys import token
 
 
@@ -188,10 +197,43 @@ def test_every_line_is_written_or_counted_however_they_come(bounded):
 def test_kinds_of_lines_take_no_memory_without_bound(bounded):
     log, written, _ = bounded
     for number in range(10_000):
-        log.info(f"a line of its own: {number}")  # noqa: G004  that is the case
+        log.warning(f"a line of its own: {number}")  # noqa: G004  that is the case
     assert len(log.handlers[0]._windows) <= 257
     log.handlers[0].close()
-    assert 256 <= len(written()) <= 256 + 3 + 1
+    *lines, summary = written()
+    assert len(lines) == 256 + 15
+    assert (summary["event"], summary["line"], summary["lines"]) == (LEFT_OUT, OF_SEVERAL_KINDS, 10_000 - len(lines))
+
+
+def test_lines_of_all_kinds_together_are_bounded_and_hide_no_warning(bounded):
+    log, written, clock = bounded
+    for status in range(400, 600):
+        log.info("request", extra={"status": status})
+    log.warning("a warning")
+    log.error("an error")
+    *requests, warning, error = written()
+    assert len(requests) == 15
+    assert (warning["event"], error["event"]) == ("a warning", "an error")
+    clock[0] = 60.0
+    log.info("next")
+    summary, following = written()
+    assert (summary["line"], summary["lines"], following["event"]) == (OF_SEVERAL_KINDS, 185, "next")
+
+
+def test_an_error_is_written_whatever_came_before_it(bounded):
+    log, written, clock = bounded
+    for number in range(1_000):
+        log.info(f"a line of its own: {number}")  # noqa: G004  that is the case
+    written()
+    for number in range(5):
+        log.error(f"failed: {number}")  # noqa: G004  that is the case
+    assert [line["event"] for line in written()] == [f"failed: {number}" for number in range(5)]
+    clock[0] = 60.0
+    refuse(log, "map_too_fine", 10)  # kinds of an earlier minute take no room
+    assert [line.get("line", line["event"]) for line in written()] == [OF_SEVERAL_KINDS, *["request"] * 3]
+    log.handlers[0].close()
+    (summary,) = written()
+    assert (summary["line"], summary["code"], summary["lines"]) == ("request", "map_too_fine", 7)
 
 
 def test_a_line_that_is_left_out_keeps_nothing_alive(bounded):
