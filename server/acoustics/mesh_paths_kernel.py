@@ -32,6 +32,8 @@ _STILL_M = 3e-4
 # Where a taut path is blocked, its bends move as far as nothing is in the way, in so many steps.
 _GUARDED_SWEEPS, _SHORTER_STEPS, _GUARDED_STILL_M = 2, 2, 1e-3
 _UNKNOWN, _SEEN, _HIDDEN = 0, 1, 2
+_FINE_M = 1.5
+"""Of what is seen from somewhere in a larger cell, its corners and its middle may see nothing."""
 
 
 @compiled
@@ -151,6 +153,17 @@ def _reach(bends: Bends, listener: Floats, cell: int, reached: Integers, reach_m
             reached[count], reach_m[count] = point, _distance(listener, bends.places[point])
             count += 1
     return count
+
+
+@compiled
+def _sees_none(tree: Tree, stack: Integers, bends: Bends, place: Floats, cell: int) -> bool:
+    """Whether a place sees none of the points of a cell, which is too large for that to mean that there are none."""
+    if max(bends.cell_m[0], bends.cell_m[1], bends.cell_m[2]) <= _FINE_M or cell == _everywhere(bends):
+        return False
+    for number in range(bends.begins[cell], bends.begins[cell + 1]):
+        if is_clear(tree, stack, place, bends.lifted[bends.seen[number]], MARGIN_M):
+            return False
+    return True
 
 
 @compiled
@@ -360,7 +373,7 @@ def find_mesh_paths(
     for band in range(len(wavelengths_m)):
         longest_m = max(longest_m, wavelengths_m[band])
     most_m = -CLEAR_FRESNEL_NUMBER * longest_m / 2
-    everywhere, listener_cell, reached_cell, count = _everywhere(bends), _cell(bends, listener), -1, 0
+    listener_cell, count = _cell(bends, listener), -1
     for row in range(len(emitters)):
         emitter = emitters[row]
         straight = _distance(listener, emitter)
@@ -384,11 +397,13 @@ def find_mesh_paths(
                 ends[3],
             )
         else:
-            if reached_cell < 0:
+            if count < 0:
                 reached_cell = listener_cell
+                if _sees_none(tree, stack, bends, listener, listener_cell):
+                    reached_cell = _everywhere(bends)
                 count = _reach(bends, listener, reached_cell, reached, reach_m)
-            last, cell = -1, _cell(bends, emitter)
-            while True:
+            cell, last = _cell(bends, emitter), -1
+            for _ in range(2):
                 last = _way_round(
                     tree,
                     stack,
@@ -405,14 +420,9 @@ def find_mesh_paths(
                     waits,
                     wait_m,
                 )
-                if last >= 0 or (cell == everywhere and reached_cell == everywhere):
+                if last >= 0 or not _sees_none(tree, stack, bends, emitter, cell):
                     break
-                # Cells lack points that are seen from small parts of them.
-                if reached_cell != everywhere:
-                    reached_cell = everywhere
-                    count = _reach(bends, listener, reached_cell, reached, reach_m)
-                    to_point[:] = -1.0
-                cell = everywhere
+                cell = _everywhere(bends)
             if last < 0:
                 for band in range(len(wavelengths_m)):
                     screen_db[row, band] = UNHEARD_DB

@@ -70,11 +70,12 @@ class MeshWallLosses:
     losses_db: _Floats
 
     def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
-        """As of `server.acoustics.transmission.WallLosses`. A wall counts once, with the material by which it is
-        entered from the listener."""
+        """As of `server.acoustics.transmission.WallLosses`. A wall counts once, with the material of the side that
+        takes more: a wall is at least as heavy as it is said to be from either side, and a light lining on it takes
+        nothing from its mass. So it takes the same from both sides."""
         walls = self.tree.walls_between(np.asarray(listener, np.float64), np.asarray(emitters, np.float64))
         surfaces = self.tree.mesh.surfaces
-        losses_db = np.array([self.losses_db[surfaces[each]].sum(axis=0) for each in walls]).reshape(
+        losses_db = np.array([self.losses_db[surfaces[each]].max(axis=1).sum(axis=0) for each in walls]).reshape(
             len(walls), self.losses_db.shape[1]
         )
         lets_through = np.isfinite(losses_db).all(axis=-1)

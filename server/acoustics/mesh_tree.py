@@ -107,13 +107,13 @@ class MeshTree:
         return in_sight.reshape(shape)
 
     def walls_between(self, a: Points, b: Points) -> list[_Integers]:
-        """For each pair of points (n, 3), the walls that the straight line goes through, each given by the triangle
-        through which it is entered from a. A wall has a face and a back, which may be the same sheet; coplanar double
-        faces are one wall."""
+        """For each pair of points (n, 3), the walls (wall, 2) that the straight line goes through, each given by the
+        triangles through which it is entered from a and left towards b. They are the same for a sheet of one face;
+        coplanar double faces are one wall. From b to a, there are the same walls."""
         starts, ends, _ = _pairs(a, b)
-        walls = np.empty((len(starts), MOST_CROSSED), np.int32)
+        walls = np.empty((len(starts), MOST_CROSSED, 2), np.int32)
         counts = np.empty(len(starts), np.int32)
-        room = np.empty(MOST_CROSSED), np.empty(MOST_CROSSED, np.int32)
+        room = np.empty(MOST_CROSSED), np.empty(MOST_CROSSED, np.int32), np.empty(MOST_CROSSED, np.int32)
         find_walls(self.tree, starts, ends, SIGHT_MARGIN_M, SAME_PLACE_M, *room, walls, counts)
         return [walls[pair, :count] for pair, count in enumerate(counts)]
 

@@ -522,16 +522,17 @@ def find_sight(tree: Tree, a: Floats, b: Floats, margin_m: float, in_sight: npt.
 
 
 @compiled_in_place
-def walls_met(distances: Floats, rows: Integers, count: int, same: float) -> int:
-    """Reduce what `cross_all` wrote to walls, and return their number: `rows` begins with the row in the tree of the
-    face by which each is entered.
+def walls_met(distances: Floats, rows: Integers, backs: Integers, count: int, same: float) -> int:
+    """Reduce what `cross_all` wrote to walls, and return their number: `rows` and `backs` begin with the rows in the
+    tree of both faces of each, which are the same for one that has only one. From the other end, there are the same
+    walls.
 
-    A wall is entered through a face and left through the back of the next one. A back that nothing was entered before
-    is a wall by itself: a sheet, seen from behind. Faces within `same` of each other are one, and with a back there
-    they are the two faces of one sheet.
+    A wall is entered through a face and left through the back of the next one. Another face or back is a wall by
+    itself, a sheet. Faces within `same` of each other are one, and with a back there they are the two faces of one
+    sheet, which is no wall between a face and the back of the next one.
     """
     walls, at = 0, 0
-    inside = False
+    entered = -1  # the wall whose face was met and no back since
     while at < count:
         end, facing, behind = at, -1, -1
         while end < count and distances[end] - distances[at] <= same:
@@ -541,19 +542,15 @@ def walls_met(distances: Floats, rows: Integers, count: int, same: float) -> int
                 behind = -1 - rows[end]
             end += 1
         at = end
-        if facing >= 0 and behind >= 0:  # a sheet of two faces, or an edge that is touched
-            if not inside:
-                rows[walls] = facing
-                walls += 1
-        elif facing >= 0:
-            rows[walls] = facing
-            walls += 1
-            inside = True
-        elif inside:
-            inside = False
-        else:
-            rows[walls] = behind
-            walls += 1
+        if facing < 0 and entered >= 0:
+            backs[entered] = behind
+            walls, entered = entered + 1, -1
+            continue
+        rows[walls] = facing if facing >= 0 else behind
+        backs[walls] = behind if behind >= 0 else facing
+        if behind < 0:
+            entered = walls
+        walls += 1
     return walls
 
 
@@ -566,11 +563,12 @@ def find_walls(
     same_m: float,
     distances: Floats,
     rows: Integers,
+    backs: Integers,
     walls: Integers,
     counts: Integers,
 ) -> None:
-    """Fill `walls` (n, most), the numbers of triangles by which walls between pairs of points are entered, and `counts`
-    (n,); see `MeshTree.walls_between`. `distances` and `rows` have the same room for what is met."""
+    """Fill `walls` (n, most, 2), the numbers of the triangles on both sides of the walls between pairs of points, and
+    `counts` (n,); see `MeshTree.walls_between`. `distances`, `rows` and `backs` have the same room for what is met."""
     stack = np.empty(STACK, np.int32)
     for pair in range(len(a)):
         x, y, z = a[pair]
@@ -581,10 +579,10 @@ def find_walls(
             continue
         margin = margin_m / length
         met = cross_all(tree, stack, x, y, z, dx, dy, dz, margin, 1 - margin, distances, rows)
-        found = walls_met(distances, rows, min(met, len(rows)), same_m / length)
+        found = walls_met(distances, rows, backs, min(met, len(rows)), same_m / length)
         counts[pair] = min(found, walls.shape[1])
         for wall in range(counts[pair]):
-            walls[pair, wall] = tree.numbers[rows[wall]]
+            walls[pair, wall, 0], walls[pair, wall, 1] = tree.numbers[rows[wall]], tree.numbers[backs[wall]]
 
 
 @compiled

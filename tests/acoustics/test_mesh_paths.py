@@ -150,8 +150,14 @@ def test_every_place_of_a_house_is_reached_the_same_way_back(in_house):
     finder, _, points = in_house
     lengths = np.array([finder.find(point, points).length_m for point in points])
     np.testing.assert_allclose(lengths, lengths.T, atol=0.05)
-    heard = np.array([finder.find(point, points).screen_db[:, 0] for point in points])
-    assert np.all(heard > -60)
+    levels = np.array([finder.find(point, points).screen_db for point in points])
+    in_sight = np.array([finder.find(point, points).in_sight for point in points])
+    np.testing.assert_array_equal(in_sight, in_sight.T)
+    back = levels.transpose(1, 0, 2)
+    np.testing.assert_allclose(levels[in_sight], back[in_sight], atol=1e-6)
+    assert np.count_nonzero(levels[in_sight].max(axis=-1) < -0.5) > 10
+    np.testing.assert_allclose(levels, back, atol=0.1)
+    assert np.all(levels[..., 0] > -60)
     # No way is longer than one by way of a third place, but for the points at which ways bend.
     through = np.min(lengths[:, :, None] + lengths[None], axis=1)
     assert np.mean(lengths > through + 0.01) < 1e-3
@@ -314,8 +320,8 @@ def test_a_house_far_from_the_origin_leads_sound_as_before():
     assert hidden > 100
 
 
-def test_a_cell_that_lacks_the_only_way_out_closes_no_room():
-    """A closet with a slit under its ceiling, in a place whose cells lack all points."""
+def test_a_large_cell_that_lacks_the_only_way_out_closes_no_room():
+    """A closet with a slit under its ceiling, in a place with one cell that lacks all points."""
     closet = (
         block((0.3, 0.3, 0.0), (0.7, 0.35, 3.0)),
         block((0.3, 0.65, 0.0), (0.7, 0.7, 3.0)),
@@ -324,13 +330,31 @@ def test_a_cell_that_lacks_the_only_way_out_closes_no_room():
     )
     tree = MeshTree(mesh_of(ROOM, *closet))
     bends = bends_of(tree)
-    begins = np.zeros_like(bends.begins)
-    begins[-1] = len(bends.places)
-    blind = bends._replace(begins=begins, seen=np.arange(len(bends.places), dtype=np.int32))
+    count = len(bends.places)
+    blind = bends._replace(
+        cell_m=np.array([10.0, 8.0, 3.0]),
+        counts=np.ones(3, np.int64),
+        begins=np.array([0, 0, count]),
+        seen=np.arange(count, dtype=np.int32),
+        origin=np.zeros(3),
+    )
     emitters = np.array([(8, 6, 1), (0.5, 0.5, 2.0), (0.2, 0.2, 1.0), (3, 1, 2)])
     for listener in ((0.5, 0.5, 0.5), (9, 1, 1)):
         expected, found = (MeshPathFinder(tree, SPEED, each).find(listener, emitters) for each in (bends, blind))
         assert expected.screen_db.min() > -80
+        np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.1)
+
+
+@pytest.mark.parametrize("beside_m", [0, 300])
+def test_houses_far_apart_are_walked_through_as_one_house_is(beside_m):
+    """Cells are as large as a house then."""
+    alone = finder_of(*small_house())
+    both = finder_of(*small_house(), *small_house((300, beside_m, 0)))
+    points = np.random.default_rng(6).uniform((0.3, 0.3, 0.2), (9.7, 5.7, 2.5), (50, 3))
+    points = points[(points[:, 0] < 4.95) | (points[:, 0] > 5.25)]
+    for listener in points:
+        expected, found = alone.find(listener, points), both.find(listener, points)
+        assert expected.screen_db.min() > -60
         np.testing.assert_allclose(found.length_m, expected.length_m, atol=0.1)
 
 

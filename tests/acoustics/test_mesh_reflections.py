@@ -157,6 +157,23 @@ def test_transmission_takes_what_the_walls_of_a_plan_take():
     assert not MeshWallLosses(tree, solid).between(listener, emitters)[0].any()
 
 
+def test_through_a_wall_with_two_materials_the_heavier_counts_from_both_sides():
+    square = np.array([(0, y, z) for y, z in ((-1, -1), (1, -1), (1, 1), (-1, 1))], dtype=float)
+    corners = np.concatenate([square, square + np.array([0.2, 0, 0])])
+    faces = np.array([(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7)])
+    tree = MeshTree(TriangleMesh(corners, faces, [0, 0, 1, 1], ("plaster", "brick")))
+    light, heavy = np.linspace(5, 20, 7), np.linspace(30, 60, 7)
+    here, there = np.array([-2.0, 0.1, 0.2]), np.array([2.0, -0.3, 0.1])
+    for losses_db in ([light, heavy], [heavy, light]):
+        for one, other in ((here, there), (there, here)):
+            through, found = MeshWallLosses(tree, np.array(losses_db)).between(one, other[None])
+            assert through.all()
+            np.testing.assert_allclose(found, heavy[None])
+    solid = np.array([np.full(7, np.inf), light])
+    for one, other in ((here, there), (there, here)):
+        assert not MeshWallLosses(tree, solid).between(one, other[None])[0].any()
+
+
 def test_turned_freely_and_in_single_precision_a_mesh_loses_no_reflection():
     """Walls of several triangles each, which rounding puts into planes that are not quite the same."""
     fine = MeshGeometry.of_plan(LARGE).mesh

@@ -195,14 +195,27 @@ def test_walls_are_counted_once_whatever_faces_they_have(parts, walls):
     assert [len(each) for each in tree.walls_between(b, a)] == [walls, walls]
 
 
-def test_a_wall_is_given_by_the_face_through_which_it_is_entered():
-    mesh = mesh_of(block((1, 0, 0), (1.2, 2, 2)))
-    (walls,), (back,) = (
-        MeshTree(mesh).walls_between([(0, 1, 0.7)], [(3, 1, 0.9)]),
-        MeshTree(mesh).walls_between([(3, 1, 0.9)], [(0, 1, 0.7)]),
-    )
-    assert mesh.corners_m[walls[0], :, 0].max() == 1
-    assert mesh.corners_m[back[0], :, 0].min() == 1.2
+def test_a_wall_is_given_by_the_faces_through_which_it_is_entered_and_left():
+    mesh = mesh_of(block((1, 0, 0), (1.2, 2, 2)), sheet(2))
+    tree = MeshTree(mesh)
+    for start, end, expected in (
+        ((0, 1, 0.7), (3, 1, 0.9), [(1, 1.2), (2, 2)]),
+        ((3, 1, 0.9), (0, 1, 0.7), [(2, 2), (1.2, 1)]),
+    ):
+        (walls,) = tree.walls_between([start], [end])
+        np.testing.assert_allclose(mesh.corners_m[walls][..., 0], np.array(expected)[..., None].repeat(3, axis=-1))
+
+
+@pytest.mark.parametrize(
+    "mesh", [soup(60, 1, 4.0), mesh_of(sheet(1), sheet(2), sheet(2, faces=((2, 1, 0), (3, 2, 0))))]
+)
+def test_from_the_other_end_there_are_the_same_walls(mesh):
+    tree = MeshTree(mesh)
+    a, b = np.random.default_rng(2).uniform(-6, 6, (2, 500, 3))
+    there, back = tree.walls_between(a, b), tree.walls_between(b, a)
+    assert max(map(len, there)) > 1
+    for one, other in zip(there, back, strict=True):
+        np.testing.assert_array_equal(one, other[::-1, ::-1])
 
 
 def test_inside_is_the_air_that_is_enclosed():
