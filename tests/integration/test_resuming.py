@@ -380,13 +380,13 @@ def wait_until_ready(address, patience_s=60.0):
 
 
 @contextmanager
-def two_processes(bundle, hrtfs):
-    """HOST:PORT of each of two servers that are processes of one."""
+def two_processes(bundle, hrtfs, max_listeners=(8, 8)):
+    """HOST:PORT of each of two servers that are processes of one, with so many listeners in a stream at each."""
     own = [listening_privately() for _ in range(2)]
     ports = tuple(each.getsockname()[1] for each in own)
     servers, threads = [], []
     for number, listener in enumerate(own):
-        settings = Settings(port=0)
+        settings = Settings(port=0, max_listeners=max_listeners[number])
         peers = ProcessPeers(number, ports, KEY)
         app = create_app(settings, scenes={"flat": FieldsByLevel.load(bundle)}, hrtfs=hrtfs, peers=peers)
         servers.append(uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings))))
@@ -471,6 +471,25 @@ def test_a_stream_that_cannot_go_on_at_another_process_is_still_where_it_was(bun
         with listening(other, before.resumption()) as again:
             again.hear(SETTLED + RATE // 4)
         assert error_db(after(again.blocks, SETTLED), expected, since) < -80
+
+
+def test_a_process_that_cannot_go_on_with_a_stream_says_so_at_once(bundle, hrtfs):
+    """It admits fewer listeners, which stands for any reason."""
+    hello = HELLO.model_copy(update={"listeners": 2})
+    with two_processes(bundle, hrtfs, (2, 1)) as (one, other), listening(one, hello) as before:
+        begin(before)
+        before.hear(RATE // 4)
+        before.drop()
+        with listening(other, before.resumption()) as refused:
+            assert refused.first.code == "too_many_listeners"
+        # Sooner than it would come back by itself.
+        end_s = time.monotonic() + 3
+        while time.monotonic() < end_s:
+            with listening(one, before.resumption()) as again:
+                if isinstance(again.first, Welcome):
+                    assert again.first.session == before.first.session
+                    return
+        raise AssertionError("the stream has not come back")
 
 
 def test_a_former_token_leads_to_the_process_to_which_its_stream_has_gone(bundle, hrtfs):
