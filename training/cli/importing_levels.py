@@ -74,7 +74,7 @@ def import_level(
 
 
 def bundle_level(
-    scene: Annotated[Path, typer.Argument(help="Folder of an imported level, or its scene.toml.")],
+    scene: Annotated[Path, typer.Argument(help="Folder of an imported level, or a scene file in it.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)],
     as_json: Json = False,
 ) -> None:
@@ -83,7 +83,7 @@ def bundle_level(
     from training.bundling.level_bundle import bundle_of_level
     from training.data.levels.level_scene import LevelScene
 
-    bundle = bundle_of_level(LevelScene.read(scene if scene.is_dir() else scene.parent), output)
+    bundle = bundle_of_level(LevelScene.read(scene), output)
     assert bundle.mesh is not None
     count = len(bundle.mesh.triangles)
     if as_json:

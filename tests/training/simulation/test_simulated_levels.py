@@ -9,6 +9,7 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from server.acoustics.decibels import power_to_db
+from server.scene.bundle import Bundle
 from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
@@ -66,6 +67,20 @@ def test_a_scene_is_read_by_its_folder_its_file_and_as_a_plan(folder):
         SceneFile.read(folder / "scene.toml")
     with pytest.raises(SceneFileError, match="cannot be read"):
         read_scene(folder.parent / "none.toml")
+
+
+def test_a_scene_file_of_another_name_is_what_is_simulated_and_bundled(folder, tmp_path):
+    level_of().write(tmp_path)
+    text = (folder / "scene.toml").read_text(encoding="utf-8")
+    variant = tmp_path / "variant.toml"
+    variant.write_text(text.replace('id = "level"', 'id = "variant"'), encoding="utf-8")
+    assert read_scene(variant).id == "variant"
+    assert read_scene(tmp_path).id == "level"
+    created = Dataset.create(tmp_path / "data", variant, 3, plan_of_level(read_scene(variant)))
+    assert created.place.id == Dataset.open(created.folder, finished=False).place.id == "variant"
+    result = CliRunner().invoke(app, ["bundle-level", str(variant), "-o", str(tmp_path / "bundle")])
+    assert result.exit_code == 0, result.output
+    assert Bundle.load(tmp_path / "bundle").id == "variant"
 
 
 def test_probes_stand_above_the_floors_and_clear_of_surfaces():
@@ -166,6 +181,35 @@ def test_doors_stand_as_open_as_they_are():
     # What goes through the shut leaf is heard, by its mass.
     positions, _ = DirectPaths.of(shut, plan_of_level(shut)).images(hall, room)
     assert any(np.allclose(position, hall) for position in positions)
+
+
+def test_a_doors_mass_is_its_own_whatever_its_materials_are_called():
+    wall = APARTMENT.geometry.materials.walls.model_copy(update={"surface_mass_kg_m2": 300.0})
+    others = ["x" * 127 + "1", "x" * 127 + "2", "walls of door middle"]
+    names = ("walls", "floor", "ceiling", *others)
+    base, sheet = level_of(), leaf()
+    mesh = replace(base.mesh, surfaces=np.arange(len(base.mesh.triangles)) % 6, materials=names)
+    doors = (door(0.0), door(0.0, name="second"))
+    leaves = tuple(replace(sheet, surfaces=[0, 1], materials=each) for each in (("walls", others[0]), others[:2]))
+    geometry = base.file.geometry.model_copy(update={"materials": dict.fromkeys(names, wall), "doors": doors})
+    place = LevelScene(base.file.model_copy(update={"geometry": geometry}), mesh, leaves).place
+    masses = [place.materials[name].surface_mass_kg_m2 for name in place.mesh.materials]
+    assert masses[:6] == [300.0] * 6
+    assert masses[6:] == [12.0] * 4
+    np.testing.assert_array_equal(place.mesh.surfaces[-4:], [6, 7, 8, 9])
+    np.testing.assert_array_equal(place.mesh.surfaces[:-4], mesh.surfaces)
+
+
+def test_doors_with_which_there_is_more_than_a_mesh_has_are_refused_by_name(tmp_path):
+    base, names = level_of(), [f"m{number}" for number in range(1023)]
+    mesh = replace(base.mesh, surfaces=np.zeros(len(base.mesh.triangles), int), materials=("walls", *names))
+    wall = APARTMENT.geometry.materials.walls
+    geometry = base.file.geometry.model_copy(
+        update={"materials": dict.fromkeys(mesh.materials, wall), "doors": (door(0.0),)}
+    )
+    LevelScene(base.file.model_copy(update={"geometry": geometry}), mesh, (leaf(),)).write(tmp_path)
+    with pytest.raises(SceneFileError, match=r"scene\.toml: geometry\.doors: .* not 1,025"):
+        read_scene(tmp_path)
 
 
 def test_a_shut_door_keeps_the_energy_of_rays():

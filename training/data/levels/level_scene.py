@@ -7,9 +7,10 @@ are above the floor that is below them. Doors stand as they are at the beginning
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -131,9 +132,12 @@ class LevelScene:
         for door, leaf in zip(self.file.geometry.doors, self.doors, strict=True):
             names = []
             for name in leaf.materials:
-                own = f"{name} of door {door.name}"[:LONGEST_NAME] if door.surface_mass_kg_m2 else name
-                mass = {"surface_mass_kg_m2": door.surface_mass_kg_m2} if door.surface_mass_kg_m2 else {}
-                materials[own] = known[name].model_copy(update=mass)
+                if door.surface_mass_kg_m2 is None:
+                    own, material = name, known[name]
+                else:
+                    own = _free_name(f"{name} of door {door.name}", known.keys() | materials.keys())
+                    material = known[name].model_copy(update={"surface_mass_kg_m2": door.surface_mass_kg_m2})
+                materials[own] = material
                 names.append(own)
             numbers = np.array([list(materials).index(name) for name in names])
             triangles.append(leaf.triangles + sum(map(len, vertices)))
@@ -171,10 +175,12 @@ class LevelScene:
         return self._paths.describe(*flat).length_m.reshape(ends[0].shape[:-1])
 
     @classmethod
-    def read(cls, folder: Path) -> "LevelScene":
-        """Raises SceneFileError naming the file and the field at fault, also for materials that a mesh has and the
-        file has not."""
-        path = folder / SCENE_FILE
+    def read(cls, path: Path) -> "LevelScene":
+        """Read a level by its scene file, beside which its meshes are, or by its folder with a `scene.toml`. Raises
+        SceneFileError naming the file and the field at fault, also for materials that a mesh has and the file has not,
+        and for doors with which there is more than a mesh may have."""
+        path = path / SCENE_FILE if path.is_dir() else path
+        folder = path.parent
         try:
             file = LevelFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
             mesh = TriangleMesh.load(folder / file.geometry.mesh)
@@ -192,7 +198,12 @@ class LevelScene:
         for name in {name for each in (mesh, *doors) for name in each.materials}:
             if name not in file.geometry.materials:
                 raise SceneFileError(f"{path}: geometry.materials: {name!r} is missing, and a mesh has it")
-        return cls(file, mesh, doors)
+        scene = cls(file, mesh, doors)
+        try:
+            _ = scene.place
+        except MeshError as exc:
+            raise SceneFileError(f"{path}: geometry.doors: with their leaves where they stand, {exc}") from exc
+        return scene
 
     def copy_meshes(self, source: Path, folder: Path) -> None:
         """Copy the meshes, but not the scene file, from one folder to another."""
@@ -228,7 +239,14 @@ def read_scene(path: Path) -> SceneFile | LevelScene:
         is_level = "mesh" in tomllib.loads(path.read_text(encoding="utf-8"))["geometry"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError):
         is_level = False  # `SceneFile.read` says what is wrong
-    return LevelScene.read(path.parent) if is_level else SceneFile.read(path)
+    return LevelScene.read(path) if is_level else SceneFile.read(path)
+
+
+def _free_name(wanted: str, taken: Collection[str]) -> str:
+    """`wanted`, no longer than a material's name may be, and with a number where that is taken."""
+    short = wanted[: LONGEST_NAME - len(f" ({len(taken) + 1})")]
+    numbered = (f"{short} ({number})" for number in count(2))
+    return next(name for name in chain([wanted[:LONGEST_NAME]], numbered) if name not in taken)
 
 
 def _table(name: str, content: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:
