@@ -5,11 +5,13 @@
 archive holds its arrays. A `Bundle` object exists only after the whole folder was read and checked.
 """
 
+import contextlib
 import hashlib
 import io
 import json
 import stat
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO
@@ -147,14 +149,30 @@ class Bundle:
 
 
 def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> Bundle:
-    """Write the files and the manifest with their hashes, and load the result back."""
+    """Write the files and the manifest with their hashes, and load the result back. Raises BundleError for what cannot
+    be loaded; then the folder is as it was before."""
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        (folder / name).write_bytes(data)
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(files.items())}
     document = manifest.model_copy(update={"files": hashes}).model_dump(mode="json")
-    (folder / MANIFEST_FILE).write_text(json.dumps(document, indent=2) + "\n")
-    return Bundle.load(folder)
+    contents = {**files, MANIFEST_FILE: (json.dumps(document, indent=2) + "\n").encode()}
+    try:
+        with tempfile.TemporaryDirectory(prefix=".writing-", dir=folder) as name:
+            trial = Path(name)
+            for file, data in contents.items():
+                (trial / file).write_bytes(data)
+            try:
+                bundle = Bundle.load(trial)
+            except BundleError as exc:
+                raise BundleError(folder / exc.path.relative_to(trial), exc.field, exc.problem) from exc
+            for file in contents:  # the manifest last
+                (trial / file).replace(folder / file)
+    except BaseException:
+        if is_new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+    return replace(bundle, folder=folder)
 
 
 def find_bundle(scene: str) -> Path:

@@ -193,6 +193,20 @@ def _refuses_arrays(bundle, tmp_path, content):
         write_bundle(tmp_path / "noise", bundle.manifest, {**files, "arrays.npz": content})
 
 
+def test_what_is_refused_leaves_a_folder_as_it_was(bundle, tmp_path):
+    _refuses_arrays(bundle, tmp_path, b"no archive")
+    assert list(tmp_path.iterdir()) == []
+    files = {name: (bundle.folder / name).read_bytes() for name in bundle.manifest.files}
+    written = write_bundle(tmp_path / "noise", bundle.manifest, files)
+    before = {path.name: path.read_bytes() for path in written.folder.iterdir()}
+    assert set(before) == {"scene.json", *files}
+    _refuses_arrays(bundle, tmp_path, b"no archive")
+    assert {path.name: path.read_bytes() for path in written.folder.iterdir()} == before
+    with pytest.raises(BundleError) as caught:
+        write_bundle(tmp_path / "noise", bundle.manifest, {**files, "arrays.npz": b"no archive"})
+    assert caught.value.path == tmp_path / "noise" / "arrays.npz"
+
+
 def test_positions_inside_pass_and_others_say_why(bundle):
     bundle.require_inside((2.0, 2.0, 1.5), "listener")
     with pytest.raises(RequestError, match=r"listener .* is outside") as caught:

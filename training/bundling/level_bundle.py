@@ -4,7 +4,7 @@ sound through walls and first reflections."""
 import math
 from pathlib import Path
 
-from server.scene.bundle import Bundle, write_bundle
+from server.scene.bundle import MOST_TRIANGLES, Bundle, write_bundle
 from server.scene.limits import MOST_SAMPLES
 from server.scene.manifest import (
     MESH_FORMAT,
@@ -25,9 +25,14 @@ _SHORTEST_S, _AFTER_S = 0.25, 0.05
 
 
 def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
-    """Write the bundle, with doors as they stand, and load it back. Raises SceneFileError for a start that is not in
-    the air."""
+    """Write the bundle, with doors as they stand, and load it back. Raises SceneFileError for more triangles than a
+    bundle may have, and for a start that is not in the air."""
     place = scene.place
+    if len(place.mesh.triangles) > MOST_TRIANGLES:
+        raise SceneFileError(
+            f"{scene.id}: geometry.mesh: {len(place.mesh.triangles):,} triangles with its doors, and a bundle has at "
+            f"most {MOST_TRIANGLES:,}: import the level with a larger --merge-within-m, or with less detail"
+        )
     for name, position in (("listener", scene.file.start.listener), ("emitter", scene.file.start.emitter)):
         if not scene.surroundings.holds(position):
             problem = "is not in the air: it is inside something, or outside"

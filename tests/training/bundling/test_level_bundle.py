@@ -1,6 +1,7 @@
 """Levels become bundles that a server takes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from typer.testing import CliRunner
 from server.api.catalogue import describe_scene
 from server.field.fields_by_level import FieldsByLevel
 from server.responses.full_response import FullResponse
-from server.scene.bundle import Bundle
+from server.scene.bundle import MOST_TRIANGLES, Bundle
 from training.bundling.level_bundle import bundle_of_level
 from training.cli.main import app
 from training.data.levels.gltf_writer import Piece, WrittenNode, write_glb
@@ -73,4 +74,13 @@ def test_a_start_inside_a_thing_is_named(level, tmp_path):
     moved = type(level)(level.file.model_copy(update={"start": start}), level.mesh, level.doors)
     with pytest.raises(SceneFileError, match=r"start\.emitter: \(3\.2, 1\.0, 1\.0\) is not in the air"):
         bundle_of_level(moved, tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_more_triangles_than_a_bundle_has_are_refused_before_anything_is_written(level, tmp_path):
+    mesh = level.mesh
+    times = MOST_TRIANGLES // len(mesh.triangles) + 1
+    many = replace(mesh, triangles=np.tile(mesh.triangles, (times, 1)), surfaces=np.tile(mesh.surfaces, times))
+    with pytest.raises(SceneFileError, match=r"geometry\.mesh: 200,\d+ triangles .* 200,000: .*--merge-within-m"):
+        bundle_of_level(replace(level, mesh=many), tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
