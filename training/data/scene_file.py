@@ -24,7 +24,9 @@ _DRAWS_PER_CELL = 32
 # At least one couple of probes is held out, and two probes make only one couple.
 FEWEST_PROBES = 3
 
-_CELLS_PER_BATCH = 256
+MOST_CELLS = 100_000
+"""The most cells of the grids around a place, many of which may lie outside the walls."""
+CELLS_PER_BATCH = 256
 LONGEST_SIDE_M, SHORTEST_SIDE_M = 1_000.0, 0.5
 TALLEST_M = 200.0
 """The tallest halls have 160 m, and the longest some 500 m."""
@@ -207,8 +209,8 @@ class SceneFile(Strict):
         # Each cell takes its first draw that is clear of the walls, so that cells along a wall have probes too.
         draws = centres[:, None] + rng.uniform(-grid.jitter_m, grid.jitter_m, (len(centres), _DRAWS_PER_CELL, 2))
         clear = np.zeros(draws.shape[:2], dtype=np.bool_)
-        for begin in range(0, len(draws), _CELLS_PER_BATCH):
-            some = slice(begin, begin + _CELLS_PER_BATCH)
+        for begin in range(0, len(draws), CELLS_PER_BATCH):
+            some = slice(begin, begin + CELLS_PER_BATCH)
             on_floor = np.concatenate([draws[some], np.zeros((*draws[some].shape[:2], 1))], axis=-1)
             clear[some] = plan.contains(on_floor) & (plan.wall_distance_m(on_floor) >= grid.wall_clearance_m)
         first = np.argmax(clear, axis=1)

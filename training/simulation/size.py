@@ -8,12 +8,10 @@ from functools import cached_property
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.levels.level_scene import LevelScene
-from training.data.scene_file import SceneFile, SceneFileError, Simulation
+from training.data.scene_file import MOST_CELLS, SceneFile, SceneFileError, Simulation
 
 MOST_PROBES = 2_000
 """The most probes. Each is heard from every other: four million pairs."""
-MOST_CELLS = 100_000
-"""The most cells of the grid around the floor plan, many of which may lie outside the walls."""
 MOST_DATASET_GB = 200.0
 MOST_MEMORY_GB = 8.0
 """The most memory for one emitter; each worker simulates one at a time."""

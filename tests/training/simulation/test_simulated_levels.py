@@ -9,13 +9,15 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from server.acoustics.decibels import power_to_db
+from server.acoustics.mesh import TriangleMesh
+from server.acoustics.surroundings import MeshSurroundings
 from server.scene.bundle import Bundle
 from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
 from training.data.dataset import Dataset, DatasetError
 from training.data.levels.level_scene import Door, LevelFile, LevelGeometry, LevelScene, read_scene
-from training.data.levels.probe_places import floors_of
+from training.data.levels.probe_places import floors_of, probe_places
 from training.data.scene_file import SceneFile, SceneFileError
 from training.parallel.jobs import open_jobs
 from training.simulation.direct_paths import DirectPaths
@@ -94,6 +96,59 @@ def test_probes_stand_above_the_floors_and_clear_of_surfaces():
     assert np.all(level.surroundings.tree.distance_m(probes) >= 0.3)
     assert len(probes) > 6
     assert floors_of(level.mesh) == [0.0]
+
+
+def sheets(*corners_m):
+    """A mesh of rectangles, each given by its corners (4, 3), in as many strips along its first side as metres."""
+    vertices, triangles = [], []
+    for corners in np.asarray(corners_m, dtype=float):
+        count = max(1, round(np.linalg.norm(corners[1] - corners[0])))
+        share = np.linspace(0, 1, count + 1)[:, None]
+        right, left = (a + share * (b - a) for a, b in (corners[:2], corners[:1:-1]))
+        first = sum(map(len, vertices)) + np.arange(count)
+        vertices += [right, left]
+        above = first + count + 1
+        triangles += [np.stack(each, -1) for each in ((first, first + 1, above + 1), (first, above + 1, above))]
+    faces = np.concatenate(triangles)
+    return TriangleMesh(np.concatenate(vertices), faces, np.zeros(len(faces), int), ("stone",))
+
+
+def rectangle(x, y, z, *, high_z=None):
+    (west, east), (south, north) = x, y
+    top = z if high_z is None else high_z
+    return [(west, south, z), (east, south, top), (east, north, top), (west, north, z)]
+
+
+def test_a_ramp_that_joins_two_floors_is_none_and_hides_none():
+    ramp = rectangle((10, 20), (0, 2), 0.0, high_z=3.0)
+    joined = sheets(rectangle((0, 10), (0, 10), 0.0), ramp, rectangle((20, 30), (0, 10), 3.0))
+    assert joined.normals[:, 2].min() > 0.9
+    np.testing.assert_allclose(floors_of(joined), [0.0, 3.0], atol=0.01)
+    # In steps of 5 cm, by which everything hangs together.
+    stairs = [rectangle((10 + at / 20, 10 + at / 20 + 0.05), (0, 2), at * 3 / 200) for at in range(200)]
+    stepped = sheets(rectangle((0, 10), (0, 10), 0.0), *stairs, rectangle((20, 30), (0, 10), 3.0))
+    np.testing.assert_allclose(floors_of(stepped), [0.0, 3.0], atol=0.01)
+    assert floors_of(sheets(rectangle((0, 0.5), (0, 0.5), 0.0))) == []
+
+
+def test_places_above_a_slope_have_one_probe_each():
+    """A slope is many floors, each of its own part of the ground."""
+    slope = MeshSurroundings(sheets(rectangle((0, 10), (0, 10), 0.0, high_z=1.5)), open_sky=True)
+    probes = PROBES.model_copy(update={"spacing_m": 1.0, "jitter_m": 0.1, "heights_m": (1.2, 1.3)})
+    found = probe_places(slope, probes, np.random.default_rng(1))
+    assert len(floors_of(slope.mesh)) > 5
+    assert 90 <= len(found) <= 110
+    above_m = found[:, 2] - 0.15 * found[:, 0]
+    assert np.all((above_m > 0.95) & (above_m < 1.5))
+
+
+def test_too_many_cells_are_refused_before_any_is_drawn():
+    base = level_of()
+    wide = replace(base.mesh, vertices_m=base.mesh.vertices_m * (100, 100, 1))
+    fine = PROBES.model_copy(update={"spacing_m": 1.0})
+    scene = LevelScene(base.file.model_copy(update={"probes": fine}), wide, ())
+    with pytest.raises(SceneFileError, match=r"level: probes\.spacing_m: at most 100,000 cells .* \d+ x \d+ cells"):
+        scene.probe_positions(1)
 
 
 def test_its_dataset_is_that_of_any_scene(dataset):

@@ -158,8 +158,11 @@ class LevelScene:
 
     def probe_positions(self, seed: int) -> _Floats:
         """(probe, 3) positions in the air above floors; the same for the same seed. Raises SceneFileError if there are
-        too few."""
-        places = probe_places(self.surroundings, self.file.probes, np.random.default_rng([seed, 0]))
+        too few, or too many cells for them."""
+        try:
+            places = probe_places(self.surroundings, self.file.probes, np.random.default_rng([seed, 0]))
+        except SceneFileError as exc:
+            raise SceneFileError(f"{self.id}: {exc}") from exc
         if len(places) < FEWEST_PROBES:
             raise SceneFileError(
                 f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit above the floors, "
