@@ -46,8 +46,9 @@ _MOST_EDGES = 8192
 """The most sides of triangles that are looked at: the longest and sharpest."""
 _SHORTEST_M = 0.05
 """An edge that is shorter gets no points: paths do not bend there."""
-_EYES, _WAYS_EACH = 256, 2
-"""Of too many stretches, those are kept that lead between so many places, by so many ways for each two of them."""
+_EYES, _ASIDE_M, _WAYS_EACH = 256, 0.3, 2
+"""Of too many stretches, those are kept that lead between so many places, half of them so far beside edges, by so many
+ways for each two of them."""
 _RADIUS_M, _LIFT_M = 0.01, 1e-3
 _LEAST_RAD = math.radians(2)
 _HALVINGS = 8
@@ -211,10 +212,16 @@ def _spread(runs: _Runs) -> tuple[_Integers, _Integers, _Floats]:
 
 def _most_useful(tree: MeshTree, points: _Points, runs: _Runs) -> _Integers:
     """The numbers of the `MOST_POINTS` stretches that lead round what hides most places from each other, and of the
-    longest if these are fewer. Places are in the air beside edges and all over the box around them, at random."""
+    longest if these are fewer. Sharp edges count more: of a ground in the open, there are many that are nearly flat.
+    Places are in the air beside edges and all over the box around them, at random."""
     middles = points.only((runs.first + runs.last) // 2)
+    extents = runs.counts * runs.spacings
+    sharpness = np.arccos(np.clip(np.sum(middles.facings[:, 0] * middles.facings[:, 1], axis=-1), -1, 1)) + _LEAST_RAD
     rng = np.random.default_rng(0)
-    beside = middles.lifted[rng.choice(len(middles.lifted), _EYES // 2, replace=False)]
+    drawn = rng.choice(len(extents), _EYES // 2, replace=False, p=sharpness**2 / np.sum(sharpness**2))
+    near, away = middles.lifted[drawn], (middles.lifted - middles.places)[drawn]
+    far = near + _ASIDE_M * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    beside = np.where(tree.is_visible(near, far)[:, None], far, near)
     low, high = middles.lifted.min(axis=0), middles.lifted.max(axis=0)
     eyes = np.concatenate([beside, rng.uniform(low, high, (_EYES - len(beside), 3))])
     seen, in_sight = np.empty((_EYES, len(middles.lifted)), np.bool_), np.empty((_EYES, _EYES), np.bool_)
@@ -226,9 +233,8 @@ def _most_useful(tree: MeshTree, points: _Points, runs: _Runs) -> _Integers:
         seen[eye] &= np.any(np.sum(middles.facings * away[:, None], axis=-1) <= slack, axis=-1)
     # How many ways each two places that do not see each other still lack.
     lack = np.where(in_sight & in_sight.T, 0, _WAYS_EACH)
-    extents = runs.counts * runs.spacings
     of_run = seen.T.astype(np.float32)
-    gains = np.sum((of_run @ (lack > 0).astype(np.float32)) * of_run, axis=-1)
+    gains = np.sum((of_run @ (lack > 0).astype(np.float32)) * of_run, axis=-1) * sharpness
     # What a stretch adds never grows: what was the best, and still is when it is counted anew, is the best of all.
     waits = [(-gain, -extent, run) for run, (gain, extent) in enumerate(zip(gains, extents, strict=True)) if gain > 0]
     heapq.heapify(waits)
@@ -236,13 +242,13 @@ def _most_useful(tree: MeshTree, points: _Points, runs: _Runs) -> _Integers:
     while waits and len(chosen) < MOST_POINTS:
         _, extent, run = heapq.heappop(waits)
         between = np.ix_(seen[:, run], seen[:, run])
-        gain = np.count_nonzero(lack[between])
+        gain = np.count_nonzero(lack[between]) * sharpness[run]
         if gain and (not waits or gain >= -waits[0][0]):
             chosen.append(run)
             lack[between] -= lack[between] > 0
         elif gain:
             heapq.heappush(waits, (-gain, extent, run))
-    others = np.setdiff1d(np.argsort(-extents, kind="stable"), chosen, assume_unique=True)
+    others = np.setdiff1d(np.argsort(-extents * sharpness, kind="stable"), chosen, assume_unique=True)
     return np.sort(np.concatenate([np.array(chosen, np.int64), others[: MOST_POINTS - len(chosen)]]))
 
 

@@ -307,6 +307,29 @@ def test_a_sky_far_away_takes_no_sound_from_a_house(half_m):
         np.testing.assert_allclose(found.screen_db, expected.screen_db, atol=1)
 
 
+def hills(cells, spacing_m, depth_m):
+    """Uneven ground below the origin."""
+    at = (np.arange(cells + 1) - cells / 2) * spacing_m
+    x, y = np.meshgrid(at, at, indexing="ij")
+    corners = np.stack([x, y, -np.random.default_rng(7).uniform(0, depth_m, x.shape)], axis=-1).reshape(-1, 3)
+    number = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
+    a, b, c, d = (each.reshape(-1) for each in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    return corners, np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)])
+
+
+def test_a_house_in_wide_hills_keeps_its_doors(caplog):
+    """The ground has more edges than are looked at, all of them longer than those of a door."""
+    points = np.random.default_rng(6).uniform((0.3, 0.3, 0.2), (9.7, 5.7, 2.5), (50, 3))
+    points = points[(points[:, 0] < 4.95) | (points[:, 0] > 5.25)]
+    alone, in_hills = finder_of(*small_house()), finder_of(hills(100, 3.0, 0.3), *small_house())
+    assert "8192 of" in caplog.text
+    assert "768 of" in caplog.text
+    expected, found = (np.array([each.find(at, points).screen_db for at in points]) for each in (alone, in_hills))
+    assert np.count_nonzero(expected[..., 0] < -6) > 300
+    assert found.min() > -60
+    assert np.mean(np.abs(found - expected).max(axis=-1) > 1) < 0.03
+
+
 def test_a_house_far_from_the_origin_leads_sound_as_before():
     far = np.array([7000.0, -4000.0, 300.0])
     near, moved = finder_of(*small_house()), finder_of(*small_house(far))
