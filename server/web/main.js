@@ -32,6 +32,8 @@ const AS_PLANNED = { early_reflections: null, late_reverberation: null };
 const ORDER = 1; // of ambisonic streams
 const NO_FIELD = "none";
 const SETTLED_MS = 300; // a choice is made for so long before another stream begins: keys pass through levels on their way
+const SLOW_MS = 1000; // after which the page says that a level is being prepared
+const GOES_ON = "What you hear goes on until it is there.";
 const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
@@ -69,7 +71,7 @@ class Page {
     this.local = null; // one that is rendered here, once it is wanted
     this.stream = this.remote; // the one that is heard
     this.used = "auto"; // the level that was chosen for it
-    this.coming = null; // {stream, output, port}: one that is being prepared, to be heard in its place
+    this.coming = null; // {stream, output, port, slow}: one that is being prepared, to be heard in its place; `slow` is a timer
     this.connection = "idle";
     this.playing = false;
     this.isFed = false; // whether the visitor's own sounds go into the stream
@@ -419,7 +421,8 @@ class Page {
   /** Opens a stream beside the one that is heard, which takes its place when it is there. */
   #prepare(stream) {
     const { port1, port2 } = new MessageChannel();
-    this.coming = { stream, ...this.#open(stream, port2), port: port1 };
+    const slow = setTimeout(() => this.notices.show("coming", `The other level is being prepared. ${GOES_ON}`, { lasting: true }), SLOW_MS);
+    this.coming = { stream, ...this.#open(stream, port2), port: port1, slow };
   }
 
   /** Opens a stream that sends its blocks to a port. Returns the output that it has. */
@@ -449,10 +452,18 @@ class Page {
 
   #callOff() {
     if (!this.coming) return;
-    const { stream, port } = this.coming;
-    this.coming = null;
+    const { stream, port } = this.#uncoming();
     stream.tell("close");
     port.close();
+  }
+
+  /** What was to come, which has come or will not. */
+  #uncoming() {
+    const { coming } = this;
+    this.coming = null;
+    clearTimeout(coming.slow);
+    this.notices.clear("coming");
+    return coming;
   }
 
   /** Goes on with what is heard, because what was to come cannot. */
@@ -463,16 +474,27 @@ class Page {
   }
 
   #comingState(detail) {
-    const { state, reason, isBusy } = detail;
-    if (state === "refused") this.#stay(reason);
-    else if (state === "waiting" && isBusy) this.notices.show("connection", "The server has no room yet. What you hear goes on until it has.");
-    else if (state === "live") this.#adopt(detail);
+    const { state, reason, isBusy, needsKey } = detail;
+    if (state === "live") this.#adopt(detail);
+    else if (state === "refused" && needsKey) this.#prepareWithKey(reason);
+    else if (state === "refused") this.#stay(reason);
+    else if (state === "waiting") {
+      clearTimeout(this.coming.slow);
+      const why = isBusy ? "The server has no room yet." : "The server cannot be reached.";
+      this.notices.show("coming", `${why} Trying again. ${GOES_ON}`, { lasting: true });
+    }
+  }
+
+  async #prepareWithKey(reason) {
+    const wanted = this.frontier.chosen;
+    this.#callOff();
+    await askForKey(reason);
+    if (this.playing && !this.coming && this.frontier.chosen === wanted) this.#prepare(this.#streamFor(wanted));
   }
 
   /** Plays the stream that has come, in place of the one that was heard. */
   #adopt(detail) {
-    const { stream, output, port } = this.coming;
-    this.coming = null;
+    const { stream, output, port } = this.#uncoming();
     const before = this.stream;
     this.#starve();
     this.#choose(stream);

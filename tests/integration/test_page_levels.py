@@ -8,10 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from server.api.api_keys import create_key
 from server.scene.bundle import BUNDLED, Bundle, write_bundle
 from server.scene.manifest import Cost, FrontierPoint
 from tests import visitor
-from tests.visitor import free_port, level_db, listen, open_page, serving, start
+from tests.visitor import free_port, level_db, listen, open_page, passing_on, serving, start
 
 browser = visitor.browser
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
@@ -155,3 +156,40 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     assert level_db(listen(page)).max() > -60
     assert complaints == []
     context.close()
+
+
+def test_a_change_to_the_server_says_what_it_waits_for(browser, several_levels, bundle, tmp_path):
+    """A server that is away, then one that asks for a key and lacks the level, and then the first again."""
+    port, keys = free_port(), tmp_path / "keys.json"
+    key, _ = create_key(keys, "", ["listen", "render"], None)
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    notice = "[...document.querySelectorAll('.notice p')].some((each) => each.textContent.includes('%s'))"
+    with passing_on(port, several_levels) as url:
+        page = open_page(context, url)
+        start(page)
+        page.select_option("#level-choice", "in-this-browser")
+        page.wait_for_function("nafir.state().level === 'in-this-browser'")
+
+    page.select_option("#level-choice", "standard")
+    page.wait_for_function(notice % "cannot be reached. Trying again. What you hear goes on")
+    assert page.evaluate("nafir.state().connection") == "live"
+    page.select_option("#level-choice", "in-this-browser")
+    page.wait_for_function(f"!{notice % 'cannot be reached'}")
+
+    other = serving(free_port(), "--bundle", str(bundle.folder), settings={"NAFIR_KEYS_FILE": str(keys)})
+    with other as url, passing_on(port, url):
+        page.select_option("#level-choice", "standard")
+        page.wait_for_selector("#key[open]")
+        page.fill("#key-field", key)
+        page.keyboard.press("Enter")
+        page.wait_for_function(notice % "is none of auto")
+        page.wait_for_function("document.getElementById('level-choice').value === 'in-this-browser'")
+        state = page.evaluate("nafir.state()")
+        assert (state["connection"], state["playing"], state["level"]) == ("live", True, "in-this-browser")
+
+    page.select_option("#level-choice", "standard")
+    page.wait_for_function(notice % "cannot be reached")
+    with passing_on(port, several_levels):
+        page.wait_for_function("nafir.state().level === 'standard'")
+        assert not page.evaluate(notice % "goes on")
+        context.close()
