@@ -1,8 +1,8 @@
 """The processes of one server (`server.api.processes`) as one to their clients: any of them answers with the metrics of
 all, and goes on with a stream that another has kept.
 
-A token says which process gave it, and bears a code that only the processes can make. So one process is asked for a
-stream, and none for a token that a client has made up.
+A token says which process gave it, and bears a tag (HMAC) that only the processes can make. So one process is asked
+for a stream, and none for a token that a client has made up.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ PEER_KEY = "X-Nafir-Process-Key"
 KEY_VARIABLE = "_NAFIR_PEERS_KEY"
 """The variable in the environment that tells a process the key of its peers."""
 _TOKEN_BYTES: Final = 24
-_CODE_BYTES: Final = 12
+_TAG_BYTES: Final = 12
 _LIVE: Final = "/livez"
 _ANSWERS_WITHIN_S: Final = 1.0
 """How long a process may take to show that it answers at all. One that is being started accepts connections before it
@@ -106,13 +106,13 @@ class ProcessPeers:
         if self.key is None:
             return random_token()
         told = f"{self.number}.{random_token()}"
-        return f"{told}.{self._code(told)}"
+        return f"{told}.{self._tag(told)}"
 
     def home_of(self, token: str) -> int | None:
         """The process that gave a token; None if none has."""
-        told, _, code = token.rpartition(".")
+        told, _, tag = token.rpartition(".")
         # guard: for a token that a client has made up nobody is asked
-        if self.key is None or not hmac.compare_digest(code.encode(), self._code(told).encode()):
+        if self.key is None or not hmac.compare_digest(tag.encode(), self._tag(told).encode()):
             return None
         return int(told.partition(".")[0])
 
@@ -137,10 +137,10 @@ class ProcessPeers:
         told = SettledStream(token=token, by=self.number, is_resumed=is_resumed)
         await self._request(number, "PUT", OWN_STREAMS, told.model_dump_json().encode())
 
-    def _code(self, told: str) -> str:
+    def _tag(self, told: str) -> str:
         assert self.key is not None
-        code = hmac.digest(self.key.encode(), told.encode(), hashlib.sha256)[:_CODE_BYTES]
-        return base64.urlsafe_b64encode(code).decode()
+        tag = hmac.digest(self.key.encode(), told.encode(), hashlib.sha256)[:_TAG_BYTES]
+        return base64.urlsafe_b64encode(tag).decode()
 
     async def _metrics(self, number: int) -> bytes | None:
         return await self._request(number, "GET", OWN_METRICS)
