@@ -73,7 +73,7 @@ def test_every_command_is_strict(module):
 
 
 INPUTS = {
-    *("bundle", "clip", "costs", "file", "hrtf", "path"),
+    *("bundle", "clip", "costs", "file", "hrtf", "key", "path"),
     *("as_long_as", "data", "materials", "points", "predictions", "teacher"),
 }
 OUTPUTS = {"output", "figure"}
