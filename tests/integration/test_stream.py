@@ -63,9 +63,17 @@ def test_sound_arrives_at_the_pace_of_time(served):
 
 
 def test_a_client_that_vanishes_leaves_no_stream_behind(served):
-    for _ in range(70):  # more than the server has streams
+    welcomes = 0
+    until_s = time.monotonic() + 30
+    while welcomes < 70:  # more than the server has streams
         with connect(f"ws://{served}/v1/stream") as client:
             client.send(HELLO)
             said = json.loads(client.recv(timeout=5))
-            assert said["type"] == "welcome", said
-            client.socket.shutdown(socket.SHUT_RDWR)
+            if said["type"] == "welcome":
+                welcomes += 1
+                client.socket.shutdown(socket.SHUT_RDWR)
+                continue
+        # A machine that is busy for a moment lets fewer begin at once.
+        assert "too many streams begin just now" in said["message"], said
+        assert time.monotonic() < until_s, said
+        time.sleep(0.1)
