@@ -86,8 +86,8 @@ def _is_better(ours: _Floats, theirs: _Floats) -> bool:
 def default_point(best: Sequence[Point], *, ms: float) -> Point:
     """The default level: of the Pareto-optimal points whose response takes at most `ms` without the cache, and whose
     error is similar to the least one, it takes those that are about as quick as the quickest, and of them the most
-    accurate. Quick is what takes least for a pose that moved and one whose head only turned. If no response takes at
-    most `ms`, it is the quickest."""
+    accurate. Quick is what takes little time for a pose that moved and one whose head only turned,
+    together. If no response takes at most `ms`, it is the quickest."""
     quick = [point for point in best if point.cost.ms_miss <= ms]
     if not quick:
         return min(best, key=lambda point: point.cost.ms_miss)
