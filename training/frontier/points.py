@@ -114,7 +114,8 @@ def default_among(points: Sequence[Point], *, ms: float) -> Point:
 
 def offered_points(points: Sequence[Point], best: Sequence[Point], default: Point, *, ms: float) -> list[Point]:
     """A few of the Pareto-optimal points, the default first. From it on down and up, each is the most accurate of those
-    that cost a third of the one before or less, or three times as much or more.
+    that cost a third of the one before or less, or three times as much or more. The cheapest of all is offered too: a
+    crowd gets it before anybody is refused.
 
     If no such point is of a field of ears, or of directions, and there are eligible `points` of one, what would be the
     default among these with this `ms` follows: both ways to predict a response can be heard side by side.
@@ -123,6 +124,8 @@ def offered_points(points: Sequence[Point], best: Sequence[Point], default: Poin
     for point in reversed(best):
         if point.cost.ms_mean * LEAST_COST_RATIO <= offered[-1].cost.ms_mean:
             offered.append(point)
+    if best[0].cost.ms_mean * SIMILAR_TIME < offered[-1].cost.ms_mean:
+        offered.append(best[0])
     dearest = default
     for point in best:
         if point.cost.ms_mean >= LEAST_COST_RATIO * dearest.cost.ms_mean:

@@ -113,12 +113,23 @@ def test_a_few_are_offered_from_the_default_on_down_and_up_each_much_cheaper_or_
     assert first is best[default]
     costs = sorted(each.cost.ms_mean for each in offered)
     assert len(set(costs)) == len(offered)
-    assert np.min(np.diff(np.log(costs))) >= np.log(LEAST_COST_RATIO) - 1e-9
+    steps = np.diff(np.log(costs))
+    # The cheapest is offered however near it is to the next.
+    assert costs[0] == times[0]
+    assert np.min(steps[1:], initial=np.inf) >= np.log(LEAST_COST_RATIO) - 1e-9
     # No room is left for another.
-    assert np.max(np.diff(np.log(costs))) < 2 * np.log(LEAST_COST_RATIO)
-    assert costs[0] < LEAST_COST_RATIO * times[0]
+    assert np.max(steps) < 2 * np.log(LEAST_COST_RATIO)
     assert costs[-1] > times[-1] / LEAST_COST_RATIO
     assert others or len(best) == 1
+
+
+def test_a_level_that_is_hardly_cheaper_than_another_is_not_offered_beside_it() -> None:
+    best = [point("a", 1, 0.5), point("b", 1.05, 0.4), point("c", 3.2, 0.3)]
+    assert names(offered_points(best, best, best[2], ms=5)) == ["c", "b"]
+    best[1] = point("b", 1.2, 0.4)
+    assert names(offered_points(best, best, best[2], ms=5)) == ["c", "a"]
+    best[1] = point("b", 1.05, 0.4)
+    assert names(offered_points(best, best, best[1], ms=5)) == ["b", "c"]
 
 
 def test_the_default_knows_directions_where_there_are_any_however_quick_others_are() -> None:
