@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from server.acoustics.bands import in_octave_above
 from server.acoustics.decibels import db_to_power
 from server.planning.change import Change
 from server.planning.cost import NOTHING, Cost, Measured, PerPose, Variant
@@ -98,7 +99,8 @@ class EnergyEffect(Effect):
     def __post_init__(self) -> None:
         gain_db = self.path_gain
         if gain_db is not None:
-            object.__setattr__(self, "direct", Factors[Way](on=lambda way: db_to_power(gain_db(way.paths))))
+            factors = Factors[Way](on=lambda way: db_to_power(in_octave_above(gain_db(way.paths))))
+            object.__setattr__(self, "direct", factors)
             object.__setattr__(self, "per_pose", lambda bundle, count: _along_paths(gain_db, bundle, count))
 
 

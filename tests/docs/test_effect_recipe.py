@@ -21,7 +21,6 @@ def test_it_takes_three_files() -> None:
     assert len(made_by(PAGE)) == 2
 
 
-@pytest.mark.long
 def test_its_test_passes_and_so_do_those_of_the_planner(tree: Path) -> None:
     pytest_passes(tree, "tests/planning/effects", "tests/planning/test_planner.py", "tests/planning/test_catalogue.py")
 
