@@ -5,7 +5,7 @@ import dataclasses
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,7 @@ from starlette.types import Scope
 from server.api.access import Access
 from server.api.access_gate import AccessGate, page_paths
 from server.api.bundle_folder import BundleFolder
+from server.api.bundle_store import BundleStore
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.compression import Compression
 from server.api.connection import MeasuredScene, StreamHost
@@ -56,6 +57,7 @@ from server.runtime.thread_pool import ThreadPool
 from server.runtime.thread_watch import ThreadWatch
 from server.runtime.traces import begin_traces
 from server.runtime.workers import Workers
+from server.scene.signatures import BundleKeys
 from server.streaming.audio_engine import AudioEngine
 from server.streaming.calibration import calibrate
 from server.streaming.load_thresholds import THRESHOLDS
@@ -97,12 +99,13 @@ def create_app(
     `hrtfs`. `drain` lets the caller begin the shutdown. `compiler` may have begun to compile already. `peers`
     are the processes of which this is one.
 
-    Raises NafirError for files of keys that cannot be used, and for traces without the extra `otel`. Without `scenes`
-    or `hrtfs` they are loaded at start-up, which raises BundleError for a damaged bundle and HrtfError for a damaged
-    HRTF file.
+    Raises NafirError for files of keys that cannot be used, for traces without the extra `otel`, and for a store of
+    bundles without the extra `store`. Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError
+    for a damaged bundle and HrtfError for a damaged HRTF file.
     """
     drain = Drain(settings.drain_s) if drain is None else drain
     end_traces = None if settings.traces_url is None else begin_traces(settings.traces_url)
+    store = None if settings.bundle_url is None else BundleStore(settings.bundle_url)
     access = Access.of(settings, own_key=None if peers is None else peers.key)
     refused = RefusedRequests()
     if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
@@ -113,12 +116,8 @@ def create_app(
         keys = settings.read_bundle_keys()
         load = partial(load_scenes, settings.bundles, keys=keys)
         loaded = dict(await asyncio.to_thread(load) if scenes is None else scenes)
-        watched = settings.bundle_folder
-        folder = None if watched is None else BundleFolder(watched, dict(loaded), keys=keys)
-        if folder is not None:
-            loaded |= (await asyncio.to_thread(folder.look, is_first=True)).loaded
-        heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
         with (
+            store or nullcontext(),
             Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
             ResponseCache(
                 # One more than there are IR workers. Maps never take the last one, so that cheap requests have it.
@@ -130,6 +129,10 @@ def create_app(
             ) as responses,
             CompilingProcess() if compiler is None else compiler as compiling,
         ):
+            folder = _watched_bundles(settings, store, dict(loaded), keys)
+            if folder is not None:
+                loaded |= (await asyncio.to_thread(folder.look, is_first=True)).loaded
+            heads = await asyncio.to_thread(load_hrtfs, settings.hrtfs, loaded) if hrtfs is None else hrtfs
             audio = AudioEngine(
                 asyncio.get_running_loop().call_soon_threadsafe,
                 workers,
@@ -202,6 +205,14 @@ def create_app(
     if settings.page:
         app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app
+
+
+def _watched_bundles(
+    settings: Settings, store: BundleStore | None, others: Mapping[str, FieldsByLevel], keys: BundleKeys | None
+) -> BundleFolder | None:
+    if store is not None:
+        return BundleFolder(store.copies, others, keys=keys, fetch=store.fetch)
+    return None if settings.bundle_folder is None else BundleFolder(settings.bundle_folder, others, keys=keys)
 
 
 def _uploads(settings: Settings) -> Uploads | None:

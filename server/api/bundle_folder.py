@@ -7,7 +7,7 @@ it is being copied. A bundle that cannot be loaded changes nothing: the scene st
 
 import logging
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -51,10 +51,18 @@ class _Known:
 class BundleFolder:
     """A scene of the folder takes the place of one of the same id among `others`, which comes back when the folder no
     longer has it. Of two sub-folders with one id, the first by name has it. Where there are `keys`, one of them has to
-    have signed each bundle."""
+    have signed each bundle. `fetch` brings the folder up to date before each look."""
 
-    def __init__(self, folder: Path, others: Mapping[str, FieldsByLevel], *, keys: BundleKeys | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        others: Mapping[str, FieldsByLevel],
+        *,
+        keys: BundleKeys | None = None,
+        fetch: Callable[[], None] | None = None,
+    ) -> None:
         self._folder = folder
+        self._fetch = fetch
         self._keys = keys
         self._others = others
         self._known: dict[Path, _Known] = {}
@@ -67,6 +75,8 @@ class BundleFolder:
     def look(self, *, is_first: bool = False) -> Changes:
         """Look at the folder, and load what has changed: work for another thread. The first look takes everything as
         it is."""
+        if self._fetch is not None:
+            self._fetch()
         stamps = self._stamps()
         before = self._served
         loaded: dict[str, FieldsByLevel] = {}

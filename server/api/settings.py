@@ -118,8 +118,11 @@ class Settings(BaseSettings):
     bundle_folder: Path | None = None
     """Folder whose sub-folders are scene bundles too. Bundles that come, change or go are loaded, replaced or dropped
     while the server runs; streams that are open finish with what they have."""
+    bundle_url: str | None = None
+    """The same in a store that fsspec reads, such as s3://games/scenes, from where each process copies the bundles to a
+    folder for temporary files. It needs the extra `store` and the package of the store, such as s3fs."""
     bundle_folder_s: Annotated[float, Field(ge=0.1)] = 5.0
-    """Seconds between two looks at `bundle_folder`. What has changed is loaded at the look after."""
+    """Seconds between two looks at `bundle_folder` or `bundle_url`. What has changed is loaded at the look after."""
     bundle_keys: Path | None = None
     """File of public keys as minisign writes them. With it only bundles that one of them has signed are served
     (`nafir sign-bundle`), besides those that come with the package."""
@@ -245,6 +248,12 @@ class Settings(BaseSettings):
         """Tokens for other services of the same issuer must not open this one."""
         if self.jwt_keys_file is not None and not self.jwt_audience:
             raise PydanticCustomError("audience", "jwt_keys_file needs jwt_audience: name whom tokens have to be for")
+        return self
+
+    @model_validator(mode="after")
+    def _has_one_place_of_bundles(self) -> Self:
+        if self.bundle_folder is not None and self.bundle_url is not None:
+            raise PydanticCustomError("bundles", "bundle_url is given, and bundle_folder too: leave one of them out")
         return self
 
     @model_validator(mode="after")
