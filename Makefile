@@ -147,7 +147,7 @@ audit: $(VENV)/installed-deploy ## look for known vulnerabilities in requirement
 	$(BIN)/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml --output-reproducible --of JSON -o sbom.json
 	$(BIN)/pip-audit --require-hashes --disable-pip --strict --requirement requirements.lock
 
-deploy-check: $(VENV)/installed-deploy ## check deploy/ with the programs that read it, of those that are installed: promtool, caddy, systemd-analyze
+deploy-check: $(VENV)/installed-deploy ## check deploy/ with the programs that read it, of those that are installed: prometheus, promtool, caddy, systemd-analyze
 	$(BIN)/pytest tests/deploy -rs
 
 vendor: ## fetch Swagger UI and Redoc, of the versions in this file, into server/web/vendor (needs npm)
