@@ -106,6 +106,19 @@ class TriangleMesh:
         chosen = np.asarray(chosen)
         return TriangleMesh(self.vertices_m, self.triangles[chosen], self.surfaces[chosen], self.materials)
 
+    @classmethod
+    def joined(cls, meshes: "Sequence[TriangleMesh]") -> "TriangleMesh":
+        """The triangles of all, in order. Materials of one name are one. Raises MeshError if they are too many."""
+        materials = tuple(dict.fromkeys(name for mesh in meshes for name in mesh.materials))
+        numbers = {name: number for number, name in enumerate(materials)}
+        begins = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+        return cls(
+            np.concatenate([mesh.vertices_m for mesh in meshes]),
+            np.concatenate([mesh.triangles + begin for mesh, begin in zip(meshes, begins, strict=False)]),
+            np.concatenate([np.array([numbers[name] for name in mesh.materials])[mesh.surfaces] for mesh in meshes]),
+            materials,
+        )
+
     def to_bytes(self) -> bytes:
         """The arrays as an .npz file. The same mesh gives the same bytes."""
         stored: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _FIELDS}

@@ -15,6 +15,7 @@ import heapq
 import itertools
 import logging
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from server.acoustics.mesh_edges_kernel import (
     find_seen,
     find_shortest,
     find_steps,
+    hide_steps,
     look_round,
 )
 from server.acoustics.mesh_tree import MeshTree
@@ -39,6 +41,8 @@ MOST_POINTS = 768
 """The most points at which paths bend. Ways between all of them take six bytes a pair."""
 _SPACING_M = 0.25
 """How far points on an edge are apart at most, unless there would be too many."""
+_LEAF_SPACING_M = 0.5
+"""The same on leaves of doors, whose points are found anew whenever they move."""
 _COARSER = 1.1
 _MOST_LOOKED_ROUND = 16_384
 """The most places on edges around which it is looked, some 70 microseconds each."""
@@ -96,8 +100,72 @@ class Bends(NamedTuple):
 def bends_of(tree: MeshTree) -> Bends:
     """Find the points of a mesh, at most `MOST_POINTS`, and the ways between them. Logs a warning if edges are left
     out for being too many."""
-    edges = _edges(tree.mesh)
-    points = _points(tree, edges)
+    spots = _spots(tree, tree.mesh, _SPACING_M)
+    steps = _steps(tree, spots)
+    return _bends(spots, steps, _cells(tree, spots.lifted, steps))
+
+
+class StillEdges:
+    """The edges of a mesh in which leaves of doors move. What the mesh alone decides is found once; `swept`, for each
+    leaf, are points (n, 3) on it all along its way."""
+
+    def __init__(self, tree: MeshTree, swept: Sequence[_Floats]) -> None:
+        self._spots = _spots(tree, tree.mesh, _SPACING_M)
+        self._steps = _steps(tree, self._spots)
+        self._cells = _cells(tree, self._spots.lifted, self._steps)
+        self._near = [_cells_in_sight(tree, self._cells, points) for points in swept]
+
+    def bends_among(self, tree: MeshTree, leaves: Sequence[TriangleMesh]) -> Bends:
+        """The points, and the ways between them, with the `leaves` where they are in `tree`. Points on their edges are
+        added, and ways that they stand in are taken away."""
+        still = len(self._spots.places)
+        of_leaves = [_spots(tree, leaf, _LEAF_SPACING_M) for leaf in leaves]
+        spots = _Spots(*(np.concatenate(parts) for parts in zip(self._spots, *of_leaves, strict=True)))
+        steps = np.full((len(spots.places), len(spots.places)), np.inf, np.float32)
+        steps[:still, :still] = self._steps
+        hide_steps(MeshTree(TriangleMesh.joined(leaves)).tree, self._spots.lifted, steps)
+        find_steps(tree.tree, spots.places, spots.lifted, spots.facings, still, steps)
+        ends = still + np.cumsum([len(each.places) for each in of_leaves])
+        points = [np.arange(end - len(each.places), end) for each, end in zip(of_leaves, ends, strict=True)]
+        return _bends(spots, steps, self._cells.with_points(self._near, points))
+
+
+class _Spots(NamedTuple):
+    """The first seven fields of `Bends`."""
+
+    places: _Floats
+    lifted: _Floats
+    facings: _Floats
+    starts: _Floats
+    alongs: _Floats
+    extents: _Floats
+    portions: _Floats
+
+
+class _Cells(NamedTuple):
+    """The last five fields of `Bends`."""
+
+    origin: _Floats
+    cell_m: _Floats
+    counts: _Integers
+    begins: _Integers
+    seen: npt.NDArray[np.int32]
+
+    def with_points(self, cells: Sequence[_Flags], points: Sequence[_Integers]) -> "_Cells":
+        """The cells with further points, group by group: each in those of the cells whose flag (cell,) is true, and in
+        the last."""
+        lists = [self.seen[begin:end] for begin, end in itertools.pairwise(self.begins)]
+        for flags, more in zip(cells, points, strict=True):
+            for cell in (*np.flatnonzero(flags), len(lists) - 1):
+                lists[cell] = np.concatenate([lists[cell], more])
+        begins = np.cumsum([0, *map(len, lists)])
+        return self._replace(begins=begins.astype(np.int64), seen=np.concatenate(lists).astype(np.int32))
+
+
+def _spots(tree: MeshTree, mesh: TriangleMesh, spacing_m: float) -> _Spots:
+    """The points on edges of `mesh`, which is in `tree`, or part of what is."""
+    edges = _edges(mesh)
+    points = _points(tree, edges, spacing_m)
     runs = _runs(points)
     kept = np.arange(len(runs.first))
     if len(kept) > MOST_POINTS:
@@ -105,28 +173,26 @@ def bends_of(tree: MeshTree) -> Bends:
         _warn(len(runs.first), MOST_POINTS)
     runs = runs.only(kept)
     low, high = _reach(tree, edges, points, runs)
-    chosen, run, portions = _spread(runs)
+    chosen, run, portions = _spread(runs, spacing_m)
     points = points.only(chosen)
     # At its very end, an edge touches what it ends at, which would be in the way.
     low, high = np.minimum(low[run] + _INSET_M, points.at), np.maximum(high[run] - _INSET_M, points.at)
-    count = len(chosen)
-    steps = np.empty((count, count), np.float32)
-    find_steps(tree.tree, points.places, points.lifted, points.facings, steps)
-    lengths, before = np.empty_like(steps), np.empty((count, count), np.int16)
-    find_shortest(steps, lengths, before)
     alongs = np.ascontiguousarray(edges.alongs[points.edge])
-    return Bends(
-        points.places,
-        points.lifted,
-        points.facings,
-        edges.starts[points.edge] + low[:, None] * alongs,
-        alongs,
-        high - low,
-        portions,
-        lengths,
-        before,
-        *_cells(tree, points.lifted, steps),
-    )
+    starts = edges.starts[points.edge] + low[:, None] * alongs
+    return _Spots(points.places, points.lifted, points.facings, starts, alongs, high - low, portions)
+
+
+def _steps(tree: MeshTree, spots: _Spots) -> npt.NDArray[np.float32]:
+    """(P, P) distances of points that a path may join directly, and infinity."""
+    steps = np.empty((len(spots.places), len(spots.places)), np.float32)
+    find_steps(tree.tree, spots.places, spots.lifted, spots.facings, 0, steps)
+    return steps
+
+
+def _bends(spots: _Spots, steps: npt.NDArray[np.float32], cells: _Cells) -> Bends:
+    lengths, before = np.empty_like(steps), np.empty(steps.shape, np.int16)
+    find_shortest(steps, lengths, before)
+    return Bends(*spots, lengths, before, *cells)
 
 
 def _warn(number: int, most: int) -> None:
@@ -176,9 +242,9 @@ class _Runs(NamedTuple):
         return _Runs(self.first[chosen], self.last[chosen], self.spacings[chosen])
 
 
-def _points(tree: MeshTree, edges: _Edges) -> _Points:
-    """The points, at most `_MOST_LOOKED_ROUND`, where edges bend sound."""
-    spacing_m = max(_SPACING_M, float(edges.extents.sum()) / (_MOST_LOOKED_ROUND - len(edges.extents)))
+def _points(tree: MeshTree, edges: _Edges, least_m: float) -> _Points:
+    """The points, at most `_MOST_LOOKED_ROUND` and at least so far apart, where edges bend sound."""
+    spacing_m = max(least_m, float(edges.extents.sum()) / (_MOST_LOOKED_ROUND - len(edges.extents)))
     numbers = np.ceil(edges.extents / spacing_m).astype(np.int64)
     edge = np.repeat(np.arange(len(numbers)), numbers)
     portions = (edges.extents / np.maximum(numbers, 1))[edge]
@@ -196,11 +262,11 @@ def _runs(points: _Points) -> _Runs:
     return _Runs(first, last, points.portions[first])
 
 
-def _spread(runs: _Runs) -> tuple[_Integers, _Integers, _Floats]:
+def _spread(runs: _Runs, spacing_m: float) -> tuple[_Integers, _Integers, _Floats]:
     """At most `MOST_POINTS` points, spread evenly over at most as many stretches: their numbers, those of their
     stretches, and for how much of an edge each stands, in metres."""
     counts, extents = runs.counts, runs.counts * runs.spacings
-    numbers, spacing_m = counts, _SPACING_M
+    numbers = counts
     while numbers.sum() > MOST_POINTS:
         spacing_m *= _COARSER
         numbers = np.minimum(counts, np.ceil(extents / spacing_m).astype(np.int64))
@@ -359,13 +425,10 @@ def _joined(place: _Floats, sides: _Integers, along: _Floats, extent: _Floats) -
     return base, low, high
 
 
-def _cells(
-    tree: MeshTree, lifted: _Floats, steps: npt.NDArray[np.float32]
-) -> tuple[_Floats, _Floats, _Integers, _Integers, npt.NDArray[np.int32]]:
-    """The last five fields of `Bends`. What is seen from a cell is what is seen from its corners, its middle, or a
-    point in it."""
+def _cells(tree: MeshTree, lifted: _Floats, steps: npt.NDArray[np.float32]) -> _Cells:
+    """What is seen from a cell is what is seen from its corners, its middle, or a point in it."""
     if not len(lifted):
-        return np.zeros(3), np.ones(3), np.ones(3, np.int64), np.zeros(3, np.int64), np.zeros(0, np.int32)
+        return _Cells(np.zeros(3), np.ones(3), np.ones(3, np.int64), np.zeros(3, np.int64), np.zeros(0, np.int32))
     low, high = tree.mesh.bounds_m
     low = np.maximum(low, lifted.min(axis=0) - _AROUND_M)
     size = np.maximum(np.minimum(high, lifted.max(axis=0) + _AROUND_M) - low, 1e-9)
@@ -376,29 +439,41 @@ def _cells(
             break
         size_m *= 1.25
     counts, cell_m = cells.astype(np.int64), size / cells
-    # Corners on the outermost surfaces would look along them.
-    inset_m = np.minimum(0.05, 0.05 * size)
-    axes = [
-        np.linspace(inset, side - inset, count + 1) for inset, side, count in zip(inset_m, size, counts, strict=True)
-    ]
-    corners = low + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    middles = (corners[:-1, :-1, :-1] + corners[1:, 1:, 1:]) / 2
-    of_corners, of_cells = (np.zeros((eyes[..., 0].size, len(lifted)), np.bool_) for eyes in (corners, middles))
-    for eyes, seen in ((corners, of_corners), (middles, of_cells)):
-        find_seen(tree.tree, np.ascontiguousarray(eyes.reshape(-1, 3)), lifted, seen)
-    around = of_corners.reshape(*corners.shape[:3], len(lifted))
-    for x, y, z in itertools.product((slice(None, -1), slice(1, None)), repeat=3):
-        of_cells |= around[x, y, z].reshape(of_cells.shape)
+    of_cells = _in_sight(tree, low, cell_m, counts, lifted)
     within = np.clip((lifted - low) // cell_m, 0, counts - 1).astype(np.int64)
     for point, cell in enumerate(np.ravel_multi_index(tuple(within.T), tuple(counts))):
         of_cells[cell] |= steps[point] < np.inf
         of_cells[cell, point] = True
     cells_seen, point_seen = np.nonzero(of_cells)
     begins = np.searchsorted(cells_seen, np.arange(len(of_cells) + 1))
-    return (
-        low,
-        cell_m,
-        counts,
-        np.append(begins, begins[-1] + len(lifted)).astype(np.int64),
-        np.concatenate([point_seen, np.arange(len(lifted))]).astype(np.int32),
-    )
+    begins = np.append(begins, begins[-1] + len(lifted)).astype(np.int64)
+    return _Cells(low, cell_m, counts, begins, np.concatenate([point_seen, np.arange(len(lifted))]).astype(np.int32))
+
+
+def _cells_in_sight(tree: MeshTree, cells: _Cells, points: _Floats) -> _Flags:
+    """(cell,) whether a corner or the middle of each cell, but for the last, sees one of the points (n, 3), or has one
+    in it."""
+    sees: _Flags = np.any(_in_sight(tree, cells.origin, cells.cell_m, cells.counts, points), axis=-1)
+    place = np.floor((points - cells.origin) / cells.cell_m)
+    within = np.clip(place, 0, cells.counts - 1).astype(np.int64)
+    sees[np.ravel_multi_index(tuple(within.T), tuple(cells.counts))] = True
+    return sees
+
+
+def _in_sight(tree: MeshTree, low: _Floats, cell_m: _Floats, counts: _Integers, points: _Floats) -> _Flags:
+    """(cell, point) whether a corner or the middle of a cell sees a point (n, 3)."""
+    # Corners on the outermost surfaces would look along them.
+    size = counts * cell_m
+    inset_m = np.minimum(0.05, 0.05 * size)
+    axes = [
+        np.linspace(inset, side - inset, count + 1) for inset, side, count in zip(inset_m, size, counts, strict=True)
+    ]
+    corners = low + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    middles = (corners[:-1, :-1, :-1] + corners[1:, 1:, 1:]) / 2
+    of_corners, of_cells = (np.zeros((eyes[..., 0].size, len(points)), np.bool_) for eyes in (corners, middles))
+    for eyes, seen in ((corners, of_corners), (middles, of_cells)):
+        find_seen(tree.tree, np.ascontiguousarray(eyes.reshape(-1, 3)), np.ascontiguousarray(points), seen)
+    around = of_corners.reshape(*corners.shape[:3], len(points))
+    for x, y, z in itertools.product((slice(None, -1), slice(1, None)), repeat=3):
+        of_cells |= around[x, y, z].reshape(of_cells.shape)
+    return of_cells

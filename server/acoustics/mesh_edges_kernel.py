@@ -137,10 +137,11 @@ def may_bend(place: Floats, facings: Floats, point: int, other: Floats) -> bool:
 
 
 @compiled
-def find_steps(tree: Tree, places: Floats, lifted: Floats, facings: Floats, steps: Singles) -> None:
-    """Fill `steps` (point, point) with distances of bends that a path may join directly, and infinity."""
+def find_steps(tree: Tree, places: Floats, lifted: Floats, facings: Floats, first: int, steps: Singles) -> None:
+    """Fill `steps` (point, point) with distances of bends that a path may join directly, and infinity: for the points
+    from `first` on, to all others."""
     stack = np.empty(STACK, np.int32)
-    for point in range(len(places)):
+    for point in range(first, len(places)):
         steps[point, point] = math.inf
         for other in range(point):
             steps[point, other] = steps[other, point] = math.inf
@@ -155,6 +156,16 @@ def find_steps(tree: Tree, places: Floats, lifted: Floats, facings: Floats, step
                     + (places[point, 2] - places[other, 2]) ** 2
                 )
                 steps[point, other] = steps[other, point] = length
+
+
+@compiled
+def hide_steps(tree: Tree, lifted: Floats, steps: Singles) -> None:
+    """Take away those `steps` (point, point) between the first points (point, 3) in whose way something stands."""
+    stack = np.empty(STACK, np.int32)
+    for point in range(len(lifted)):
+        for other in range(point):
+            if steps[point, other] < math.inf and not is_clear(tree, stack, lifted[point], lifted[other], MARGIN_M):
+                steps[point, other] = steps[other, point] = math.inf
 
 
 @compiled

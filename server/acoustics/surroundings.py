@@ -99,23 +99,35 @@ class PlanSurroundings:
 
 
 class MeshSurroundings:
-    """The surfaces of a triangle mesh. With `open_sky`, the air is not enclosed."""
+    """The surfaces of a triangle mesh. With `open_sky`, the air is not enclosed.
 
-    def __init__(self, mesh: TriangleMesh, *, open_sky: bool = False) -> None:
+    `tree` and `bends` are the mesh's, if they were found already. Where doors move, `still` is the tree of the surfaces
+    that do not: it says what is in the air, so that no leaf shuts anybody in.
+    """
+
+    def __init__(
+        self,
+        mesh: TriangleMesh,
+        *,
+        open_sky: bool = False,
+        tree: MeshTree | None = None,
+        bends: Bends | None = None,
+        still: MeshTree | None = None,
+    ) -> None:
         self.mesh = mesh
+        self.tree = MeshTree(mesh) if tree is None else tree
         self._open_sky = open_sky
-
-    @cached_property
-    def tree(self) -> MeshTree:
-        return MeshTree(self.mesh)
+        self._still = self.tree if still is None else still
+        self._found = bends
 
     @cached_property
     def _mirrors(self) -> Patches:
         return mirrors_of(self.tree)
 
     @cached_property
-    def _bends(self) -> Bends:
-        return bends_of(self.tree)
+    def bends(self) -> Bends:
+        """The points round which sound bends, and the ways between them."""
+        return bends_of(self.tree) if self._found is None else self._found
 
     @property
     def bounds_m(self) -> _Floats:
@@ -126,7 +138,7 @@ class MeshSurroundings:
         return True
 
     def contains(self, points: Points) -> _Flags:
-        return self.tree.contains(points, is_open=self._open_sky)
+        return self._still.contains(points, is_open=self._open_sky)
 
     def holds(self, position: Vector3) -> bool:
         return bool(self.contains(np.asarray(position)))
@@ -135,7 +147,7 @@ class MeshSurroundings:
         return self.tree.is_visible(a, b)
 
     def sound_paths(self, speed_of_sound: float) -> SoundPathFinder:
-        return MeshPathFinder(self.tree, speed_of_sound, self._bends)
+        return MeshPathFinder(self.tree, speed_of_sound, self.bends)
 
     def first_reflections(self, gains_db: npt.ArrayLike, losses_db: npt.ArrayLike | None = None) -> PathFinder:
         finder = MeshReflectionFinder(self.tree, gains_db, self._mirrors)

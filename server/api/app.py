@@ -150,7 +150,7 @@ def create_app(
                 audio=audio,
                 settings=settings,
                 responses=responses,
-                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, responses.pool, encoders))),
+                readiness=Readiness(drain, ThreadWatch((audio, workers.pool, workers.ways, responses.pool, encoders))),
                 encoders=encoders,
                 uploads=_uploads(settings),
                 peers=peers,

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from server.acoustics.mesh import TriangleMesh
 from server.assets.clips import Clip, ClipLibrary, DecodeError
 from server.assets.hrtfs import HrtfLibrary
 from server.assets.names import named_by_stem
@@ -13,8 +14,10 @@ from server.core.errors import BundleError
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.codecs import libopus
 from server.protocol.codecs.registry import CODECS, OPUS_MEANING
-from server.protocol.server_messages import Place, SceneDescription
+from server.protocol.server_messages import DoorDescription, Place, SceneDescription
 from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
+from server.scene.door import Door
+from server.scene.outline import hull_in_plan
 from server.scene.signatures import BundleKeys
 
 _logger = logging.getLogger(__name__)
@@ -74,6 +77,25 @@ def playable_clips(clips: ClipLibrary) -> list[Clip]:
     return playable
 
 
+def _leaves(bundle: Bundle) -> tuple[TriangleMesh, ...]:
+    return () if bundle.moving is None else tuple(leaf.mesh for leaf in bundle.moving.leaves)
+
+
+def _describe_door(door: Door, leaf: TriangleMesh) -> DoorDescription:
+    (_, _, bottom_m), (_, _, top_m) = leaf.bounds_m.tolist()
+    return DoorDescription(
+        name=door.name,
+        kind=door.kind,
+        pivot=door.pivot,
+        angle_deg=door.angle_deg,
+        slide_m=door.slide_m,
+        openness=door.openness,
+        footprint=tuple((round(x, 4), round(y, 4)) for x, y in hull_in_plan(leaf.corners_m.reshape(-1, 3))),
+        bottom_m=round(bottom_m, 4),
+        top_m=round(top_m, 4),
+    )
+
+
 def describe_scene(levels: FieldsByLevel) -> SceneDescription:
     field, manifest = levels.at_rate(None).default, levels.bundle.manifest
     start, plan = manifest.start, levels.bundle.floor_plan
@@ -91,6 +113,8 @@ def describe_scene(levels: FieldsByLevel) -> SceneDescription:
         corners=plan.corners,
         height_m=plan.height_m - plan.floor_m,
         openings=() if manifest.geometry is None else manifest.geometry.openings,
+        is_mesh=manifest.mesh is not None,
+        doors=tuple(map(_describe_door, levels.bundle.doors, _leaves(levels.bundle))),
         listener=Place(position=start.listener, yaw=math.radians(start.listener_yaw_deg)),
         emitter=Place(position=start.emitter),
         level=field.level.name,

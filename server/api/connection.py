@@ -733,6 +733,7 @@ class Connection:
                 resumed=None if lost is None else self._continue(session, others, lost, block_s),
                 order=hello.ambisonic_order,
                 opus=None if encoder is None else encoder.streams,
+                doors=session.doors,
             )
         )
         self._enqueue(errors)

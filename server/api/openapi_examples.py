@@ -32,6 +32,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "spacing_m": 2,
     "walks": True,
     "move": False,
+    "door": "kitchen=0.5",
     "effect": f"{[*EffectName][-1]}=off",
     "sample_rate": 48_000,
     "file": MANIFEST_FILE,

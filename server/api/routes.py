@@ -59,6 +59,7 @@ from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.traces import span
 from server.scene.bundle import Bundle
+from server.scene.door import DOOR_PATTERN, MOST_DOORS, parse_doors, read_openness
 from server.scene.manifest_schema import manifest_schema
 
 MAX_MAP_SPACING_M = 20.0
@@ -88,6 +89,13 @@ LevelText = Annotated[str | None, Query(description="quality level; by default t
 ScenePath = Annotated[str, Path(description="id of a scene")]
 PositionText = Annotated[str, Query(description="x,y,z in metres", json_schema_extra=_PLACE)]
 YawDeg = Annotated[Number, Query(**_TURNS, description="of the head, counter-clockwise, 0 looks along +x")]
+DoorTexts = Annotated[
+    list[Annotated[str, Field(json_schema_extra={"pattern": DOOR_PATTERN})]] | None,
+    Query(
+        description="NAME=SHARE, how far a door of the scene is open, from 0 to 1; may be repeated",
+        json_schema_extra={"maxItems": MOST_DOORS},
+    ),
+]
 EffectText = Annotated[str, Field(json_schema_extra={"pattern": EFFECT_PATTERN})]
 _IR_TYPES = {"content": {each: {"schema": {"type": "string", "format": "binary"}} for each in MEDIA_TYPES.values()}}
 _IR_TYPES["content"]["application/json"] = {"schema": {"type": "object"}}
@@ -247,12 +255,13 @@ async def impulse_response(
         WholeNumber | None, Query(**_between(1, HIGHEST_ORDER), description="of ambisonics; by default 1")
     ] = None,
     level: LevelText = None,
+    door: DoorTexts = None,
     format: Annotated[  # noqa: A002  the parameter's name
         str, Query(description="wav, npy, json or sofa", json_schema_extra={"enum": [*IR_FORMATS]})
     ] = "wav",
 ) -> Response:
     """The impulse response between two places, as `nafir ir` writes it."""
-    field = _levels(request, scene).choose(level)
+    field = _in_state(_levels(request, scene), door).choose(level)
     name = parse_format(format)
     angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
     query = IrQuery.of(
@@ -290,7 +299,7 @@ async def impulse_responses(request: Request, scene: ScenePath) -> Response:
     except ClientDisconnect:
         return Response(status_code=CLIENT_CLOSED_REQUEST)
     batch = ResponseBatch.parse(text, most=host.settings.max_poses)
-    field = levels.choose(batch.level)
+    field = levels.with_doors(read_openness(levels.bundle.doors, batch.doors or {})).choose(batch.level)
     queries = batch.queries(field)
     filters = host.hrtfs.filters(queries[0].hrtf, field.sample_rate)
     writer = batch.writer(queries)
@@ -322,10 +331,11 @@ async def loudness(
         ),
     ] = None,
     level: LevelText = None,
+    door: DoorTexts = None,
     format: Annotated[str, Query(description="png or json", json_schema_extra={"enum": ["png", "json"]})] = "png",  # noqa: A002  the parameter's name
 ) -> Response:
     """Map of an emitter's loudness over the scene."""
-    field = _levels(request, scene).choose(level)
+    field = _in_state(_levels(request, scene), door).choose(level)
     if format not in {"png", "json"}:
         raise RequestError("unknown_format", f"{format!r} is none of png, json", field="format")
     position = parse_position(emitter, "emitter")
@@ -373,6 +383,7 @@ async def plan(
         str, Query(description="headphones, mono or ambisonics", json_schema_extra={"enum": [*OUTPUTS]})
     ] = "headphones",
     level: LevelText = None,
+    door: DoorTexts = None,
     effect: Annotated[list[EffectText] | None, Query(description="NAME=on or NAME=off; may be repeated")] = None,
 ) -> Response:
     """The effects that a situation calls for, with reasons and their costs on this host."""
@@ -388,7 +399,7 @@ async def plan(
         output=output,
         effects=parse_effects(effect or []),
     )
-    levels = _levels(request, scene)
+    levels = _in_state(_levels(request, scene), door)
     field = levels.choose(level)
     query.check(field)
     bus = field.level.bus
@@ -653,6 +664,11 @@ def _levels(request: Request, scene: str) -> FieldsByLevel:
         return _host(request).scenes[scene]
     except KeyError:
         raise RequestError("unknown_scene", f"there is no scene {scene!r}", field="scene", status=404) from None
+
+
+def _in_state(levels: FieldsByLevel, door: list[str] | None) -> FieldsByLevel:
+    """The levels with the scene's doors open as a query says. Raises RequestError for a door that there is not."""
+    return levels.with_doors(read_openness(levels.bundle.doors, parse_doors(door or ())))
 
 
 async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:

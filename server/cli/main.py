@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from server.field.field import AcousticField
     from server.offline.render import RenderedEmitter
     from server.planning.scene_acoustics import Output
+    from server.scene.bundle import Bundle
 
 app = StrictTyper(
     name="nafir",
@@ -55,6 +56,10 @@ app.command()(listening_results)
 
 Scene = Annotated[str, typer.Argument(help="Id of a bundled scene, or the folder of any scene bundle.")]
 Level = Annotated[str | None, typer.Option(help="Quality level of the scene. [default: its first]", metavar="NAME")]
+Doors = Annotated[
+    list[str] | None,
+    typer.Option(help="How far a door of the scene is open, 0 shut to 1; repeatable.", metavar="NAME=SHARE"),
+]
 Hrtf = Annotated[Path | None, typer.Option(help="SOFA file with the head to use instead of KEMAR.")]
 Ambisonics = Annotated[
     bool, typer.Option("--ambisonics", help="AmbiX channels (ACN, SN3D) in place of two ears, in the head's axes.")
@@ -176,6 +181,7 @@ def ir(
     order: Order = None,
     mono: Annotated[bool, typer.Option("--mono", help="One channel, without a head.")] = False,
     level: Level = None,
+    door: Doors = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the impulse response between two places: two ears, ambisonics or one channel."""
@@ -187,7 +193,7 @@ def ir(
     name = parse_format(output.suffix.removeprefix("."))
     outputs = {"binaural": binaural, "ambisonics": ambisonics, "mono": mono}
     require_at_most_one({f"--{each}": is_given for each, is_given in outputs.items()})
-    bundle = Bundle.load(find_bundle(scene))
+    bundle = _with_doors(Bundle.load(find_bundle(scene)), door)
     field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     query = IrQuery.of(
         field,
@@ -246,6 +252,7 @@ def irs(
     from server.responses.impulse_response import ImpulseResponse
     from server.responses.response_batch import BATCH_FORMATS, ResponseBatch
     from server.scene.bundle import Bundle, find_bundle
+    from server.scene.door import read_openness
 
     name = output.suffix.removeprefix(".")
     if name not in BATCH_FORMATS:
@@ -255,6 +262,7 @@ def irs(
     if batch.format not in {None, name}:
         raise NafirError(f"{poses}: format: is {batch.format}, and --output is {output}: leave the format out")
     bundle = Bundle.load(find_bundle(scene))
+    bundle = bundle.with_doors(read_openness(bundle.doors, batch.doors or {}))
     field = AcousticField.load(bundle, level=None if batch.level is None else require_level(bundle, batch.level))
     batch = batch.model_copy(update={"format": name, "hrtf": hrtf.stem if hrtf and not batch.hrtf else batch.hrtf})
     queries = batch.queries(field)
@@ -332,6 +340,7 @@ def render(
         typer.Option(help="Render at this rate, as a stream may: 44100, 48000 or 96000. [default: the scene's]"),
     ] = None,
     level: Level = None,
+    door: Doors = None,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the clips, as a stream does.")] = False,
     hrtf: Hrtf = None,
     effects: Annotated[
@@ -375,7 +384,7 @@ def render(
         raise NafirError(
             f"--hrtf and --effects {effects} contradict each other: add hrtf to the effects, or leave one out"
         )
-    bundle = Bundle.load(find_bundle(scene))
+    bundle = _with_doors(Bundle.load(find_bundle(scene)), door)
     levels = FieldsByLevel.load(bundle).at_rate(sample_rate)
     if ambisonics:
         levels = levels.with_directions(level)
@@ -453,6 +462,7 @@ def plan(
         bool, typer.Option("--ambisonics", help="Plan for ambisonic channels instead of headphones.")
     ] = False,
     level: Level = None,
+    door: Doors = None,
     effect: Annotated[
         list[str] | None, typer.Option(help="Switch an effect on or off; repeatable.", metavar="NAME=on|off")
     ] = None,
@@ -480,7 +490,7 @@ def plan(
         output="ambisonics" if ambisonics else "mono" if mono else "headphones",
         effects=parse_effects(effect or ()),
     )
-    bundle = Bundle.load(find_bundle(scene))
+    bundle = _with_doors(Bundle.load(find_bundle(scene)), door)
     field = AcousticField.load(bundle, level=None if level is None else require_level(bundle, level))
     document = PlanDocument.of(field.bundle.id, query.plan(field))
     if figure is not None:
@@ -497,6 +507,12 @@ def protocol() -> None:
     from server.api.asyncapi import document
 
     typer.echo(document())
+
+
+def _with_doors(bundle: "Bundle", door: list[str] | None) -> "Bundle":
+    from server.scene.door import parse_doors, read_openness
+
+    return bundle.with_doors(read_openness(bundle.doors, parse_doors(door or ())))
 
 
 def _read_emitter(text: str, field: "AcousticField", *, loop: bool) -> "RenderedEmitter":

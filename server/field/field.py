@@ -500,7 +500,10 @@ class Silence(AcousticField):
         self.level = level
         self._sample_rate = bundle.manifest.codec.sample_rate if sample_rate is None else sample_rate
         self.source = ComputedResponses(self.impulse_responses)
-        self._paths = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
+
+    @cached_property
+    def _paths(self) -> SoundPathFinder:  # type: ignore[override]
+        return self.bundle.surroundings.sound_paths(self.bundle.manifest.speed_of_sound)
 
     @property
     def sample_rate(self) -> int:
@@ -513,6 +516,10 @@ class Silence(AcousticField):
 
     def through(self, filters: HeadFilters) -> "Silence":  # noqa: ARG002  all heads hear the same
         return self
+
+    def within(self, bundle: Bundle) -> "Silence":
+        """The same in another state of its scene's doors."""
+        return Silence(bundle, self.level, self._sample_rate)
 
     def impulse_responses(
         self,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from server.acoustics.doors import Openness
 from server.acoustics.phase import FrozenNoise
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import RequestError
@@ -15,6 +16,9 @@ from server.scene.bundle import Bundle
 from server.scene.limits import STREAM_RATES_HZ
 from server.scene.manifest import CodecParameters
 
+_KEPT_STATES = 16
+"""States of doors whose levels are kept."""
+
 
 class FieldsByLevel(Mapping[str, AcousticField]):
     """The fields by the name of their quality level, in the manifest's order; the first is the default."""
@@ -23,6 +27,7 @@ class FieldsByLevel(Mapping[str, AcousticField]):
         """`fields` are of one bundle, at least one; levels that reuse responses keep them in `node_cache`."""
         self.node_cache: NodeCache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self._fields = {field.level.name: field for field in fields}
+        self._states: BoundedCache[Openness, FieldsByLevel] = BoundedCache(_KEPT_STATES)
 
     @classmethod
     def load(cls, bundle: Bundle, threads: int = 1) -> "FieldsByLevel":
@@ -104,6 +109,21 @@ class FieldsByLevel(Mapping[str, AcousticField]):
             problem = f"scene {self.bundle.id!r} is rendered at {offered} Hz: ask for one of these, or leave it out"
             raise RequestError("unsupported_sample_rate", f"sample_rate: {problem}", field="sample_rate")
         return FieldsByLevel([at_rate(field, wanted) for field in self._fields.values()], self.node_cache)
+
+    def with_doors(self, openness: Openness) -> "FieldsByLevel":
+        """The same levels with the scene's doors open so far. The first use of a state that was not asked for lately is
+        tens of milliseconds of work."""
+        if openness == self.bundle.openness:
+            return self
+        levels = self._states.get(openness)
+        if levels is None:
+            bundle = self.bundle.with_doors(openness)
+            # Fields know nothing of doors: a scene with doors has none.
+            levels = FieldsByLevel(
+                [field.within(bundle) for field in self._fields.values() if isinstance(field, Silence)]
+            )
+            self._states.put(openness, levels, 1)
+        return levels
 
     @property
     def knows_directions(self) -> bool:

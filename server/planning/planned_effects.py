@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from server.acoustics.geometry import Pose
+from server.acoustics.surroundings import Surroundings
 from server.planning.catalogue import emitter_effects, shared_effects
 from server.planning.cost import Costs
 from server.planning.motion import Motion
@@ -99,6 +100,11 @@ class PlannedEffects:
         if self.plan is None or not self.plan.shared:
             return SharedEffects(head=self.overrides.get(EffectName.HRTF, self.output == "headphones"))
         return shared_effects(self.plan)
+
+    def move_to(self, surroundings: Surroundings) -> None:
+        """Plan from now on for other surroundings: doors have moved."""
+        self.place = dataclasses.replace(self.place, surroundings=surroundings)
+        self._is_stale = True
 
     def wish(self, wishes: Mapping[EffectName, bool | None], output: Output | None) -> None:
         """Switch effects on or off by hand, or with None leave them to the plan or the scene; change the output if

@@ -38,6 +38,7 @@ from server.protocol.codecs.registry import Encoding
 from server.protocol.layout import Layout
 from server.protocol.message import WHOLE, Integer, Message, Position
 from server.protocol.opus import OpusOptions
+from server.scene.door import MOST_DOORS, OpenShare
 
 PROTOCOL: Final = 3
 MOST_LISTENERS: Final = 64
@@ -114,8 +115,9 @@ class Hello(Message):
     effects on or off, whatever the plan would decide. `emitters` is how many emitters the client is about to add: the
     server lets the stream in only if they fit, and keeps room for them for some seconds. Without it the server expects
     as many as other streams have. `listeners` is how many listeners the stream is about to have, with the first one:
-    room is kept for them in the same way, and `welcome` says with `max_listeners` how many there may be. With
-    `snapshots` the server sends a `snapshot` every few seconds, if it gives any."""
+    room is kept for them in the same way, and `welcome` says with `max_listeners` how many there may be. `doors` says
+    how far doors of the scene are open at first, by name; all others are as the scene has them. With `snapshots` the
+    server sends a `snapshot` every few seconds, if it gives any."""
 
     type: Literal["hello"] = "hello"
     protocol: Integer
@@ -132,6 +134,7 @@ class Hello(Message):
     effects: dict[str, bool] = Field(default_factory=dict, max_length=32)
     emitters: Annotated[int, Field(ge=0, le=64), WHOLE] | None = None
     listeners: Annotated[int, Field(ge=1, le=MOST_LISTENERS), WHOLE] | None = None
+    doors: dict[str, OpenShare] = Field(default_factory=dict, max_length=MOST_DOORS)
     # guard: a buffer has blocks, and not too many
     buffer_blocks: Annotated[int, Field(ge=1, le=32), WHOLE] = 8
     snapshots: bool = False
@@ -299,6 +302,16 @@ class SetGain(Message):
     ramp_s: RampTime = 0.0
 
 
+class SetDoor(Message):
+    """Opens or shuts a door of the scene, for all listeners: `openness` is 0 shut and 1 open. A door that swings sends
+    one for each step. Straight and bent sound follows within a block or two, mirrored sound and reverberation when
+    responses have been computed. A door is open from the beginning as the `hello` says, or as the scene has it."""
+
+    type: Literal["set_door"] = "set_door"
+    door: Annotated[str, Field(min_length=1, max_length=64)]
+    openness: OpenShare
+
+
 class SetLevel(Message):
     """Chooses a quality level, or auto, for all listeners. A `level_changed` says from when it is heard."""
 
@@ -416,6 +429,7 @@ TextMessage = (
     | MoveEmitter
     | StopEmitter
     | SetGain
+    | SetDoor
     | SetLevel
     | SetEffects
     | RemoveEmitter

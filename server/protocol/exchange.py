@@ -20,12 +20,14 @@ from server.protocol.client_messages import (
     RemoveEmitter,
     RemoveListener,
     Resume,
+    SetDoor,
     SetEffects,
     SetGain,
     SetLevel,
     StopEmitter,
 )
 from server.protocol.server_messages import (
+    DoorDescription,
     Durations,
     EffectDecision,
     EmitterAdded,
@@ -95,6 +97,20 @@ _STUDIO: Final = SceneDescription(
     corners=((0, 0), (7, 0), (7, 4), (0, 4)),
     height_m=2.8,
     openings=(Opening(name="door", start=(5.0, 1.0), end=(5.0, 2.0)),),
+    is_mesh=True,
+    doors=(
+        DoorDescription(
+            name="booth",
+            kind="swing",
+            pivot=(5.0, 1.0, 0.0),
+            angle_deg=90.0,
+            slide_m=(0.0, 1.0, 0.0),
+            openness=1.0,
+            footprint=((4.95, 1.0), (5.0, 1.0), (5.0, 2.0), (4.95, 2.0)),
+            bottom_m=0.0,
+            top_m=2.1,
+        ),
+    ),
     listener=Place(position=(1.5, 2.0, 1.6)),
     emitter=Place(position=(6.0, 2.5, 1.5)),
     level="fine",
@@ -119,6 +135,7 @@ _WELCOME = Welcome(
     max_emitters=16,
     resume_token="4qVh3mXv0y8Jc1tYb2Rk9wLs6dZf7GpA",
     resume_s=15.0,
+    doors={"booth": 1.0},
 )
 EXCHANGE: Final[tuple[Step, ...]] = (
     Step(
@@ -184,6 +201,7 @@ EXCHANGE: Final[tuple[Step, ...]] = (
     Step("moves the microphone", MoveEmitter(id="me", position=(2.5, 2.0, 1.5), pose_id=3)),
     Step("turns it down", SetGain(id="me", gain_db=-12.0)),
     Step("fades the talker to a whisper within two seconds", SetGain(id="talker", gain_db=-24.0, ramp_s=2.0)),
+    Step("shuts the door of the booth", SetDoor(door="booth", openness=0.0)),
     Step(
         "lets a door slam at clock 43 200, once",
         AddEmitter(

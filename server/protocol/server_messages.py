@@ -23,11 +23,30 @@ class Place(Message):
     yaw: float = 0.0
 
 
+class DoorDescription(Message):
+    """A door. A swing turns by `angle_deg` about `pivot`, counter-clockwise as seen from above, when it opens; a slide
+    moves by `slide_m`. `openness` is that at the beginning, from 0, shut, to 1. `footprint` is the outline of the shut
+    leaf as seen from above, between the heights `bottom_m` and `top_m`."""
+
+    name: str
+    kind: Literal["swing", "slide"]
+    pivot: Position
+    angle_deg: float
+    slide_m: Position
+    openness: float
+    footprint: tuple[tuple[float, float], ...]
+    bottom_m: float
+    top_m: float
+
+
 class SceneDescription(Message):
     """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
     are unknown. `sample_rate` is that of the scene's fields and of single responses, and a stream may have any of
     `sample_rates`. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are
     the quality levels that know from where sound arrives, so that a stream of them may be ambisonic.
+
+    `is_mesh` says that its surfaces are a triangle mesh, of which `corners` are the outline of the bounds. `doors` can
+    be opened and shut; `footprint` is where the leaf stands when shut, seen from above.
 
     `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
     scene's fields break, each with the reason why the scene is offered all the same.
@@ -46,6 +65,8 @@ class SceneDescription(Message):
     corners: tuple[tuple[float, float], ...]
     height_m: float
     openings: tuple[Opening, ...]
+    is_mesh: Annotated[bool, Field(exclude_if=lambda is_mesh: not is_mesh)] = False
+    doors: Annotated[tuple[DoorDescription, ...], Field(exclude_if=lambda doors: not doors)] = ()
     listener: Place
     emitter: Place
     level: str
@@ -81,7 +102,7 @@ class Welcome(Message):
     quality level. `max_emitters` is how many emitters the stream may have at once. `order` is that of ambisonic
     channels; streams of other outputs do not have it. `opus` says how to decode the encoding `opus`; streams of other
     encodings do not have it. `max_listeners` is how many listeners the stream may have at once, if the `hello` said how
-    many it will have.
+    many it will have. `doors` says how far each door is open; scenes without doors do not have it.
 
     With `resume_token` a client resumes the stream within `resume_s` seconds after its connection is lost. Keep it
     secret: whoever has it can take the stream over. `resumed` says where a resumed stream goes on; a new one does not
@@ -107,6 +128,7 @@ class Welcome(Message):
     resumed: Annotated[Resumed | None, Field(exclude_if=lambda resumed: resumed is None)] = None
     order: Annotated[int | None, Field(exclude_if=lambda order: order is None)] = None
     opus: Annotated[OpusStreams | None, Field(exclude_if=lambda opus: opus is None)] = None
+    doors: Annotated[dict[str, float] | None, Field(exclude_if=lambda doors: doors is None)] = None
 
 
 class SnapshotTaken(Message):

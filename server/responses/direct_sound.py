@@ -5,6 +5,7 @@ here too.
 Lengths are in metres; positions and directions are in the world's axes.
 """
 
+import copy
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
@@ -143,6 +144,15 @@ class DirectSound:
             order=order,
             field_filters=field_filters,
         )
+
+    def within(self, surroundings: Surroundings) -> "DirectSound":
+        """The same in other surroundings of the same materials: where doors have moved."""
+        moved = copy.copy(self)
+        moved._finder = surroundings.sound_paths(self._speed_of_sound)
+        for name in ("early_reflections", "early_without_head"):
+            early: EarlyReflections | None = getattr(self, name)
+            setattr(moved, name, None if early is None else early.within(surroundings))
+        return moved
 
     def renderer(
         self,

@@ -10,6 +10,7 @@ impulse response, and impulse responses are crossfaded.
 Axes: B poses; responses (B, ear, sample). Lengths are in metres; positions and directions are in the world's axes.
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -55,9 +56,8 @@ class EarlyReflections:
         """`surfaces` are the materials of the surroundings. With `transmission`, sound that goes straight through
         walls, attenuated by their mass, is added as well."""
         self.filters = filters
-        self._finder = surroundings.first_reflections(
-            mirror_gains_db(surfaces), wall_losses_db(surfaces) if transmission else None
-        )
+        self._gains_and_losses_db = mirror_gains_db(surfaces), wall_losses_db(surfaces) if transmission else None
+        self._finder = surroundings.first_reflections(*self._gains_and_losses_db)
         # Each of the two legs of a path is at most as long as the diagonal of the place.
         low, high = surroundings.bounds_m
         longest_s = 2 * math.hypot(*(high - low)) / speed_of_sound
@@ -80,6 +80,12 @@ class EarlyReflections:
             filters=filters,
             transmission=manifest.transmission,
         )
+
+    def within(self, surroundings: Surroundings) -> "EarlyReflections":
+        """The same in other surroundings, as large and of the same materials: where doors have moved."""
+        moved = copy.copy(self)
+        moved._finder = surroundings.first_reflections(*self._gains_and_losses_db)
+        return moved
 
     def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
         """Add the first reflections of each emitter at `listener` to its response (B, channel, sample); sample 0 is

@@ -270,8 +270,10 @@ def require_directions(field: AcousticField) -> None:
 
 
 def entity_tag(field: AcousticField, kind: str, parameters: dict[str, object], name: str) -> str:
-    """Return the entity tag of a result computed from a field's bundle, its level and `parameters`, in format
-    `name`."""
+    """Return the entity tag of a result computed from a field's bundle with its doors as they are, its level and
+    `parameters`, in format `name`."""
+    if field.bundle.doors:
+        parameters = {**parameters, "doors": field.bundle.openness}
     return computed_tag(field.bundle.digest, field.level.name, kind, parameters, name)
 
 

@@ -25,6 +25,7 @@ from server.core.numerals import as_whole
 from server.core.zip_parts import ZipParts
 from server.field.field import AcousticField
 from server.responses.impulse_response import USUAL_ORDER, ImpulseResponse, IrOutput, IrQuery, own_output
+from server.scene.door import MOST_DOORS, OpenShare
 
 BatchFormat = Literal["npz", "zip", "sofa"]
 BATCH_FORMATS: Final[tuple[BatchFormat, ...]] = get_args(BatchFormat)
@@ -108,6 +109,10 @@ class ResponseBatch(_Strict):
             max_length=_LONGEST_NAME,
             description="head of binaural responses, one of GET /v1/hrtfs; by default kemar",
         ),
+    ] = None
+    doors: Annotated[
+        dict[Annotated[str, Field(max_length=64)], OpenShare] | None,
+        Field(max_length=MOST_DOORS, description="how far doors of the scene are open, by name"),
     ] = None
     format: Annotated[
         BatchFormat | None,

@@ -8,13 +8,14 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, Final, Literal, Self, TypeVar, get_args
+from typing import Any, Final, Literal, Self, TypeVar
 
 from server.runtime.thread_pool import ThreadPool
 
 T = TypeVar("T")
-Kind = Literal["response", "plan"]
-"""Impulse responses, or plans of effects with their audits."""
+Kind = Literal["response", "plan", "ways"]
+"""Impulse responses, plans of effects with their audits, or the ways of sound where doors have moved. These take long,
+so a thread of their own finds them."""
 _SHARES: Final[Mapping[Kind, float]] = {"response": 0.75, "plan": 0.25}
 """The share of the workers' CPU time that each kind has while both wait. A reverberation that lags is heard; a plan
 looks seconds ahead."""
@@ -32,8 +33,9 @@ class Workers:
         self.pool = ThreadPool(threads, name, initializer=initializer, patience_s=_PATIENCE_S)
         self._unfinished: deque[None] = deque()
         """One entry for each unfinished piece of work."""
+        self.ways = ThreadPool(1, f"{name}-ways", initializer=initializer, patience_s=_PATIENCE_S)
         self._urgent: deque[Callable[[], None]] = deque()
-        self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in get_args(Kind)}
+        self._usual: dict[Kind, deque[Callable[[], None]]] = {kind: deque() for kind in _SHARES}
         self._used_s = dict.fromkeys(self._usual, 0.0)
         """CPU time that each kind has taken, divided by its share."""
         self._choosing = threading.Lock()
@@ -43,6 +45,7 @@ class Workers:
 
     def __exit__(self, *_: object) -> None:
         self.pool.stop(_STOP_S)
+        self.ways.stop(_STOP_S)
 
     @property
     def are_busy(self) -> bool:
@@ -56,6 +59,9 @@ class Workers:
         asked = [(work, args)]
         future.add_done_callback(lambda _: asked.clear())  # what was called off keeps nothing alive while it waits
         run = partial(_settle, future, asked)
+        if kind == "ways":
+            self.ways.submit(run)
+            return future
         self._unfinished.append(None)
         (self._urgent if is_urgent else self._usual[kind]).append(run)
         self.pool.submit(self._run_next)

@@ -2,7 +2,8 @@
 
 `scene.json` describes the scene and lists the SHA-256 of every other file. `*.onnx` are the fields. `arrays.npz` holds
 `frozen_noise` (2, sample), the white signal behind the late reverberation of the scene. If the place is a mesh, another
-archive holds its arrays. A `Bundle` object exists only after the whole folder was read and checked.
+archive holds its arrays, and one for each door those of its leaf. A `Bundle` object exists only after the whole folder
+was read and checked.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import io
 import json
 import stat
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
+from server.acoustics.doors import DoorLeaf, MeshWithDoors, Openness
 from server.acoustics.geometry import FloorPlan, Vector3
 from server.acoustics.mesh import MeshError, TriangleMesh
 from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings, Surroundings
@@ -27,6 +30,7 @@ from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
 from server.core.npy import MOST_HEADER_BYTES, NpyHeader
 from server.core.npz import NpzArchive, NpzError
+from server.scene.door import Door, openness_of
 from server.scene.geometry import Material
 from server.scene.manifest import ARRAYS_FILE, Manifest, SceneMesh
 from server.scene.signatures import MOST_SIGNATURE_BYTES, SIGNATURE_FILE, BundleKeys
@@ -52,7 +56,8 @@ _ARCHIVE_OVERHEAD_BYTES = 2**16
 class Bundle:
     """A checked scene bundle. `contents` holds the bytes of its files by name, `scene.json` among them, as they were
     checked: those in the folder may be others by now. `frozen_noise` (2, sample) is empty if the scene has no fields.
-    `mesh` is None for a floor plan, and where walls are unknown."""
+    `mesh` is None for a floor plan, and where walls are unknown. It has no leaves: these are in `moving`, if there are
+    doors."""
 
     folder: Path
     manifest: Manifest
@@ -60,6 +65,7 @@ class Bundle:
     contents: dict[str, bytes]
     frozen_noise: npt.NDArray[np.float32]
     mesh: TriangleMesh | None = None
+    moving: MeshWithDoors | None = None
 
     @classmethod
     def load(cls, folder: Path, *, keys: BundleKeys | None = None) -> "Bundle":
@@ -85,8 +91,12 @@ class Bundle:
         noise = np.zeros((2, 0), np.float32)
         if manifest.fields:
             noise = _frozen_noise(folder / ARRAYS_FILE, contents[ARRAYS_FILE], manifest.codec.samples)
-        mesh = None if manifest.mesh is None else _mesh(folder, manifest.mesh, contents[manifest.mesh.file])
-        bundle = cls(folder, manifest, hashlib.sha256(text).hexdigest(), {MANIFEST_FILE: text, **contents}, noise, mesh)
+        mesh = None if manifest.mesh is None else _mesh(folder, manifest.mesh, manifest.mesh.file, contents)
+        moving = None
+        if manifest.mesh is not None and mesh is not None and manifest.mesh.doors:
+            moving = _moving(folder, manifest.mesh, mesh, contents)
+        digest = hashlib.sha256(text).hexdigest()
+        bundle = cls(folder, manifest, digest, {MANIFEST_FILE: text, **contents}, noise, mesh, moving)
         bundle._require_places(path)
         return bundle
 
@@ -103,9 +113,28 @@ class Bundle:
     def floor_plan(self) -> FloorPlan:
         return self.manifest.floor_plan
 
+    @property
+    def doors(self) -> tuple[Door, ...]:
+        return () if self.manifest.mesh is None else self.manifest.mesh.doors
+
+    @property
+    def openness(self) -> Openness:
+        """How far its doors are open, in their order."""
+        return openness_of(self.doors)
+
+    def with_doors(self, openness: Openness) -> "Bundle":
+        """The same scene with its doors open so far at the beginning."""
+        if self.manifest.mesh is None or openness == self.openness:
+            return self
+        doors = [door.model_copy(update={"openness": share}) for door, share in zip(self.doors, openness, strict=True)]
+        mesh = self.manifest.mesh.model_copy(update={"doors": tuple(doors)})
+        return replace(self, manifest=self.manifest.model_copy(update={"mesh": mesh}))
+
     @cached_property
     def surroundings(self) -> Surroundings:
-        """The geometry by which sound is computed."""
+        """The geometry by which sound is computed, with doors as at the beginning."""
+        if self.moving is not None:
+            return self.moving.at(self.openness)
         if self.mesh is not None and self.manifest.mesh is not None:
             return MeshSurroundings(self.mesh, open_sky=self.manifest.mesh.open_sky)
         return PlanSurroundings(self.floor_plan)
@@ -114,7 +143,8 @@ class Bundle:
     def surfaces(self) -> tuple[Material, ...] | None:
         """The materials of its surfaces, as the geometry numbers them; None if they are unknown."""
         if self.mesh is not None and self.manifest.mesh is not None:
-            return tuple(self.manifest.mesh.materials[name] for name in self.mesh.materials)
+            names = self.mesh.materials if self.moving is None else self.moving.materials
+            return tuple(self.manifest.mesh.materials[name] for name in names)
         return None if self.manifest.geometry is None else self.manifest.geometry.materials.surfaces
 
     def _require_places(self, path: Path) -> None:
@@ -131,8 +161,12 @@ class Bundle:
             box = " to ".join(str([round(float(side), 3) for side in corner]) for corner in (low, high))
             raise BundleError(path, "bounds", f"must lie in the box around the mesh, {box}")
         for name, position in (("listener", manifest.start.listener), ("emitter", manifest.start.emitter)):
-            if not self.surroundings.holds(position):
+            if not self.holds(position):
                 raise BundleError(path, f"start.{name}", "is not in the air: the mesh has it inside a wall or outside")
+
+    def holds(self, position: Vector3) -> bool:
+        """Whether a point is in the air. Leaves of doors do not count."""
+        return self.surroundings.holds(position) if self.moving is None else self.moving.holds(position)
 
     def require_inside(self, position: Vector3, field: str) -> None:
         """Raises RequestError `position_out_of_bounds` unless the position is finite, within the bounds and not
@@ -141,7 +175,7 @@ class Bundle:
         sides = zip(bounds.minimum, position, bounds.maximum, strict=True)
         # guard: a place is within the bounds
         in_box = all(least <= at <= most for least, at, most in sides)
-        if in_box and self.surroundings.holds(position):
+        if in_box and self.holds(position):
             return
         place = ", ".join(f"{coordinate:g}" for coordinate in position)
         problem = "is inside a wall" if in_box else f"is outside {list(bounds.minimum)} to {list(bounds.maximum)} m"
@@ -208,18 +242,39 @@ def _read_listed(folder: Path, manifest: Manifest) -> dict[str, bytes]:
     return contents
 
 
-def _mesh(folder: Path, described: SceneMesh, data: bytes) -> TriangleMesh:
+def _mesh(folder: Path, described: SceneMesh, file: str, contents: Mapping[str, bytes]) -> TriangleMesh:
     """The mesh from its archive. Raises BundleError for arrays that are none, and for a material that the manifest does
     not describe."""
     try:
-        mesh = TriangleMesh.from_bytes(data, most_triangles=MOST_TRIANGLES, most_vertices=3 * MOST_TRIANGLES)
+        mesh = TriangleMesh.from_bytes(contents[file], most_triangles=MOST_TRIANGLES, most_vertices=3 * MOST_TRIANGLES)
     except MeshError as exc:
-        raise BundleError(folder / described.file, "mesh", str(exc)) from exc
+        raise BundleError(folder / file, "mesh", str(exc)) from exc
     missing = [name for name in mesh.materials if name not in described.materials]
     if missing:
-        told = f"{missing[0]!r} is missing, and {described.file} has it: give its absorption and scattering"
+        told = f"{missing[0]!r} is missing, and {file} has it: give its absorption and scattering"
         raise BundleError(folder / MANIFEST_FILE, "mesh.materials", told)
     return mesh
+
+
+def _moving(folder: Path, described: SceneMesh, still: TriangleMesh, contents: Mapping[str, bytes]) -> MeshWithDoors:
+    """The mesh with the leaves of its doors. Raises BundleError for leaves that are none, that are too many triangles
+    with the mesh, or that go too far."""
+    leaves = []
+    for door in described.doors:
+        leaf = DoorLeaf(_mesh(folder, described, door.mesh, contents), door.motion)
+        # guard: a leaf stays near the place that it is of
+        if np.any(np.abs(leaf.swept() - still.bounds_m.mean(axis=0)) > LONGEST_MESH_M):
+            problem = f"moves its leaf farther than {LONGEST_MESH_M:g} m from the mesh"
+            raise BundleError(folder / MANIFEST_FILE, f"mesh.doors.{door.name}", problem)
+        leaves.append(leaf)
+    count = len(still.triangles) + sum(len(leaf.mesh.triangles) for leaf in leaves)
+    if count > MOST_TRIANGLES:
+        problem = f"leaves make it {count:,} triangles, and a bundle has at most {MOST_TRIANGLES:,}"
+        raise BundleError(folder / MANIFEST_FILE, "mesh.doors", problem)
+    try:
+        return MeshWithDoors(still, leaves, open_sky=described.open_sky)
+    except MeshError as exc:
+        raise BundleError(folder / MANIFEST_FILE, "mesh.doors", str(exc)) from exc
 
 
 def _noise_bytes(samples: int) -> int:

@@ -32,6 +32,7 @@ from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.mesh import MOST_MATERIALS
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
+from server.scene.door import MOST_DOORS, Door
 from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Material, Point, Strict
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
@@ -65,11 +66,32 @@ class SceneMesh(Strict):
     """Surfaces as triangles. `file` is an archive of arrays: `vertices_m` (vertex, 3) float64; `triangles` (triangle,
     3) int32, counter-clockwise as seen from the air; `surfaces` (triangle,) int32, the number of each triangle's
     material in `materials`, (material,) names. What these names are made of is in `materials` here. With `open_sky`,
-    the surfaces enclose no air, and sound may leave."""
+    the surfaces enclose no air, and sound may leave. The leaves of `doors` are apart from the rest, at most eight."""
 
     file: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.npz$")]
     materials: Annotated[dict[str, Material], Field(min_length=1, max_length=MOST_MATERIALS)]
     open_sky: bool = False
+    doors: tuple[Door, ...] = ()
+
+    @field_validator("doors")
+    @classmethod
+    def _are_few_and_have_names_of_their_own(cls, doors: tuple[Door, ...]) -> tuple[Door, ...]:
+        if len(doors) > MOST_DOORS:
+            raise ValueError(
+                f"there are {len(doors)}, and a scene has at most {MOST_DOORS}: leave those that never move in the mesh"
+            )
+        for what in ("name", "mesh"):
+            given = [getattr(door, what) for door in doors]
+            if twice := [each for each in given if given.count(each) > 1]:
+                raise ValueError(f"two have the {what} {twice[0]!r}")
+        return doors
+
+    @model_serializer(mode="wrap")
+    def _without_doors_that_are_none(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+        document: dict[str, object] = write(self)
+        if not self.doors:
+            document.pop("doors", None)
+        return document
 
 
 class Start(Strict):
@@ -472,6 +494,13 @@ class Manifest(Strict):
             raise ValueError(f"mesh.file: {ARRAYS_FILE} is for frozen_noise: give the mesh a file of its own")
         if self.mesh.file not in self.files:
             raise ValueError(f"mesh.file: {self.mesh.file} is not listed in files")
+        for door in self.mesh.doors:
+            if door.mesh in (ARRAYS_FILE, self.mesh.file) or door.mesh not in self.files:
+                raise ValueError(
+                    f"mesh.doors.{door.name}.mesh: give the leaf a file of its own that is listed in files"
+                )
+        if self.mesh.doors and self.fields:
+            raise ValueError("mesh.doors: fields do not know doors: leave one of them out")
         for level in self.levels:
             if level.reuse is not None:
                 raise ValueError(f"levels.{level.name}.reuse: is for floor plans: leave it out where there is a mesh")

@@ -6,6 +6,8 @@ Edge i runs from corner i to corner i + 1, and the last one back to corner 0. Un
 import math
 from collections.abc import Sequence
 
+import numpy as np
+import numpy.typing as npt
 import shapely
 
 SHORTEST_WALL_M = 0.001
@@ -78,3 +80,11 @@ def _overlap(common: shapely.LineString) -> str:
 
 def _place(point: Sequence[float]) -> str:
     return f"({point[0]:.6g}, {point[1]:.6g})"
+
+
+def hull_in_plan(points: npt.NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+    """The outline, counter-clockwise, of points (n, 3) as seen from above: two corners if they lie on a line."""
+    hull = shapely.MultiPoint(points[:, :2]).convex_hull
+    around = shapely.normalize(hull).reverse().exterior if isinstance(hull, shapely.Polygon) else hull
+    corners = list(dict.fromkeys(around.coords))
+    return tuple((x, y) for x, y in corners)

@@ -29,6 +29,7 @@ from server.protocol.client_messages import (
     MoveEmitter,
     RemoveEmitter,
     RemoveListener,
+    SetDoor,
     SetEffects,
     SetGain,
     StopEmitter,
@@ -207,7 +208,7 @@ class Audience:
         events = self.collect(self.first, self._of_one(message))
         if any(isinstance(event, Error) for event in events):
             return events
-        if isinstance(message, MoveEmitter | RemoveEmitter | SetGain | StopEmitter | SetEffects):
+        if isinstance(message, MoveEmitter | RemoveEmitter | SetGain | StopEmitter | SetEffects | SetDoor):
             for member in self.members[1:]:
                 events += self.collect(member, member.session.receive(message))
         return events

@@ -26,6 +26,11 @@ class DirectPathTracker:
         self._known = 0
         """The number of emitters in `_ways`."""
 
+    def hear_by(self, direct_sound: DirectSound) -> None:
+        """Find all paths anew, by another direct sound."""
+        self._direct_sound = direct_sound
+        self._place, self._ways, self._known = None, [], 0
+
     def follow(self, listener: Pose) -> None:
         """Set the direct paths of the next block from the present positions of emitters and listener."""
         if not self._direct_sound.is_heard_apart:

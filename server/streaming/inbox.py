@@ -11,6 +11,7 @@ from server.planning.plan import Plan
 from server.protocol.client_messages import MOST_LISTENERS, AddEmitter, ClientMessage, ListenerPose, RemoveListener
 from server.responses.ir_request import IrRequest, IrResponse
 from server.streaming.audience import Member, NewListener
+from server.streaming.doors import DoorRequest, DoorsMoved
 from server.streaming.plan_audit import Regret
 from server.streaming.quality_steps import QualityStep
 
@@ -55,6 +56,8 @@ class Inbox:
         """Responses, each with the listener for whom it was requested."""
         self.plans: deque[tuple[Member, tuple[Plan, float] | BaseException]] = deque()
         """Plans, each with the listener for whom it was made and the CPU time that it took."""
+        self.doors: deque[tuple[Member, DoorRequest, DoorsMoved | BaseException]] = deque()
+        """States of doors, each with the listener for whom it was requested."""
         self.regrets: deque[tuple[Member, Regret | BaseException]] = deque()
         self.brings_emitter = False
         """Whether a waiting message adds an emitter, or a listener who hears those there are."""
@@ -98,8 +101,8 @@ class Inbox:
 
     @property
     def has_answers(self) -> bool:
-        """Whether a response or a plan has arrived, which is processed before the next block."""
-        return bool(self.responses or self.plans)
+        """Whether a response, a plan or a state of doors has arrived, which is processed before the next block."""
+        return bool(self.responses or self.plans or self.doors)
 
     def take_messages(self) -> Iterator[tuple[float, StreamMessage]]:
         """Take the messages that wait now, each with its time of arrival."""

@@ -100,6 +100,19 @@ class ResponseScheduler:
         """Whether the last check found IRs to request, and it is time to request them."""
         return self._demand is _Demand.LATER and not self.are_awaited
 
+    @property
+    def levels(self) -> FieldsByLevel:
+        """The levels by which responses are computed."""
+        return self._levels
+
+    def hear_by(self, direct_sound: DirectSound, levels: FieldsByLevel) -> None:
+        """Ask for all responses anew, by another direct sound and by the same levels of other surroundings."""
+        self._direct_sound, self._levels = direct_sound, levels
+        for emitter in self._emitters.values():
+            emitter.is_outdated = True
+        self._next_request_clock = 0
+        self._look_again()
+
     def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
         """Change to another quality step: from now on, or for another level when its IRs have arrived."""
         if quality.level != self._wanted.level:

@@ -34,6 +34,7 @@ from server.protocol.client_messages import (
     ListenerStart,
     MoveEmitter,
     RemoveEmitter,
+    SetDoor,
     SetEffects,
     SetGain,
     StopEmitter,
@@ -59,9 +60,11 @@ from server.responses.direct_sound import DirectSound
 from server.responses.ir_request import IrRequest, IrResponse
 from server.responses.radiation import reverberation_gain
 from server.scene.bundle import Bundle
+from server.scene.door import read_openness
 from server.scene.effects import read_overrides, require_effect
 from server.streaming.active_effects import ActiveEffects
 from server.streaming.direct_path_tracker import DirectPathTracker
+from server.streaming.doors import DoorRequest, DoorsMoved, FollowedDoors
 from server.streaming.emitters import LiveInput, Stage, StreamedEmitter
 from server.streaming.pacing import SendWindow
 from server.streaming.plan_audit import PlanAudit, Regret
@@ -166,6 +169,11 @@ class Session:
             direct_sound=self._direct_sound,
             quality=quality,
         )
+        self._doors: FollowedDoors | None = None
+        if self._bundle.moving is not None:
+            self._doors = FollowedDoors(self._bundle.moving, levels, self._direct_sound, hello.doors)
+        else:
+            read_openness((), hello.doors)
         self._next_serial = 0
         self._followed_pose_id = 0  # the pose of the direct paths
         self._checked = 0
@@ -236,6 +244,8 @@ class Session:
                     self._push(message)
                 case SetEffects():
                     self._wish(message)
+                case SetDoor():
+                    self._set_door(message)
                 case RemoveEmitter():
                     return self._remove_emitter(message)
                 case Acknowledge():
@@ -253,7 +263,9 @@ class Session:
 
     def take_request(self, scope: Scope = Scope.ALL) -> IrRequest | None:
         """Return the IRs to compute now; None while a request is unanswered, if every IR is up to date, or if none is
-        in `scope`."""
+        in `scope`. There are none before doors are as the stream began."""
+        if self._doors is not None and not self._doors.is_heard:
+            return None
         return self._responses.take_request(self._listener, scope)
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
@@ -279,6 +291,40 @@ class Session:
         is_other = planned.accept(plan)
         events = self._responses.enforce_plan()
         return [*events, PlanChanged.of(plan, self.sample_clock)] if is_other else events
+
+    @property
+    def levels(self) -> FieldsByLevel:
+        """The levels by which responses are computed now."""
+        return self._responses.levels
+
+    @property
+    def doors(self) -> dict[str, float] | None:
+        """How far each door is open; None if there are none."""
+        return None if self._doors is None else self._doors.by_name
+
+    def take_door_requests(self) -> list[DoorRequest]:
+        """Return the states of doors to prepare now."""
+        return [] if self._doors is None else self._doors.take_requests()
+
+    def adopt_doors(self, moved: DoorsMoved) -> None:
+        """Hear with doors as they were prepared, from the next block on: straight and bent sound at once, mirrored
+        sound when its responses have arrived."""
+        assert self._doors is not None
+        if not self._doors.accept(moved):
+            return
+        self._direct_sound = moved.direct_sound
+        self._aim.hear_by(moved.direct_sound)
+        for identifier, emitter in self._emitters.items():
+            self._effects.unbake(identifier, emitter)
+        self._responses.hear_by(moved.direct_sound, moved.levels)
+        if self._effects.planned is not None:
+            self._effects.planned.move_to(moved.surroundings)
+
+    def leave_doors(self, request: DoorRequest) -> list[ServerMessage]:
+        """Note that a state of doors could not be prepared: they stay as they are heard."""
+        assert self._doors is not None
+        self._doors.give_up(request)
+        return [Error(code="door_failure", message="doors could not be moved, and stay as they were")]
 
     def take_check(self) -> PlanAudit | None:
         """Return a check of the active plan, for each emitter in turn; None if everything is on."""
@@ -400,6 +446,8 @@ class Session:
             "output": self._output,
             "emitters": len(self._emitters),
         }
+        if self._doors is not None:
+            now["doors"] = self._doors.by_name
         if planned is not None:
             now["effects"] = {name.value: is_on for name, is_on in planned.wishes.items()}
         given = {name: getattr(self._hello, name) for name in Hello.model_fields}
@@ -436,6 +484,8 @@ class Session:
         self._output = other._output
         if self._effects.planned is not None and other._effects.planned is not None:
             self._effects.planned.wish_as(other._effects.planned)
+        if self._doors is not None and other._doors is not None:
+            self._doors.follow(other._doors)
         for emitter in other.emitters.values():
             self._restore_emitter(emitter.kept(), emitter)
         self.set_quality(quality, "chosen")
@@ -477,6 +527,12 @@ class Session:
             wishes = {require_effect(name): is_on for name, is_on in message.effects.items()}
             self._effects.planned.wish(wishes, message.output)
         self._output = output
+
+    def _set_door(self, message: SetDoor) -> None:
+        if self._doors is None:
+            read_openness((), {message.door: message.openness})
+        else:
+            self._doors.set(message.door, message.openness)
 
     def _move_listener(self, message: ListenerPose) -> None:
         pose = message.pose

@@ -19,13 +19,14 @@ from server.field.fields_by_level import FieldsByLevel
 from server.planning.plan import Plan
 from server.planning.planned_effects import PlanRequest
 from server.protocol.blocks import AudioBlock, Packets
-from server.protocol.client_messages import AddEmitter, ListenerPose, MoveEmitter, SetLevel
+from server.protocol.client_messages import AddEmitter, ListenerPose, MoveEmitter, SetDoor, SetLevel
 from server.protocol.server_messages import Durations, Error, LevelReason, ServerMessage, Status
 from server.protocol.snapshot import Snapshot
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
 from server.streaming.audience import Audience, Member, NewListener
+from server.streaming.doors import DoorRequest, DoorsMoved
 from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, StreamMessage, TakeSnapshot
 from server.streaming.load_policy import Ladder, LoadSample
 from server.streaming.pacing import StreamClock
@@ -221,7 +222,7 @@ class Stream:
         # While a request is unanswered there is no other, and the answer wakes the thread too.
         asks = isinstance(message, ListenerPose | MoveEmitter | AddEmitter) and self._asks_at_once
         if (
-            asks or self._inbox.asks_for_state or self._pause.is_paused
+            asks or isinstance(message, SetDoor) or self._inbox.asks_for_state or self._pause.is_paused
         ):  # a paused stream has no blocks that would wake the thread
             self._wake()
         return True
@@ -282,6 +283,8 @@ class Stream:
             outgoing += self._take_answer(*inbox.responses.popleft())
         while inbox.plans:
             outgoing += self._take_plan(*inbox.plans.popleft())
+        while inbox.doors:
+            outgoing += self._take_doors(*inbox.doors.popleft())
         for arrived_s, message in inbox.take_messages():
             if isinstance(message, TakeSnapshot):
                 outgoing.append(self._state(message))
@@ -313,6 +316,9 @@ class Stream:
             if (wanted := member.session.take_plan_request()) is not None:
                 plan = workers.submit(_plan_timed, wanted, kind="plan", is_urgent=wanted.is_first)
                 member.pending.keep_outcome(plan, partial(self._keep_plan, member))
+            for door in member.session.take_door_requests():
+                moved = workers.submit(door.prepare, kind="ways" if door.before is None else "response", is_urgent=True)
+                member.pending.keep_outcome(moved, partial(self._keep_doors, member, door))
             self._ask(workers, member)
 
     def _ask(self, workers: Workers, member: Member) -> None:
@@ -325,7 +331,7 @@ class Stream:
             member.has_asked, member.asked_last_s = True, self._time_s()
             self._turns.note(member)
             answer = workers.submit(
-                _compute_timed, self._levels, request, session, kind="response", is_urgent=request.is_first
+                _compute_timed, session.levels, request, session, kind="response", is_urgent=request.is_first
             )
             member.pending.keep_outcome(answer, partial(self._keep_answer, member, request))
         member.wait.note(member.has_asked or member.wants_turn, self._time_s())
@@ -472,7 +478,7 @@ class Stream:
         member = self.audience.members[self._checks % len(self.audience.members)]
         if (check := member.session.take_check()) is not None:
             self._next_check_s = None
-            regret = workers.submit(check.run, self._levels[check.level], kind="plan")
+            regret = workers.submit(check.run, member.session.levels[check.level], kind="plan")
             self._checking.keep_outcome(regret, partial(self._keep_regret, member))
 
     def _keep_regret(self, member: Member, regret: Regret | BaseException) -> None:
@@ -501,6 +507,21 @@ class Stream:
         plan, cpu_s = planned
         self._costs.plan_s = _smoothed(self._costs.plan_s, cpu_s)
         return self.audience.adopt(member, plan)
+
+    def _keep_doors(self, member: Member, request: DoorRequest, moved: DoorsMoved | BaseException) -> None:
+        self._inbox.doors.append((member, request, moved))
+        self._wake()
+
+    def _take_doors(
+        self, member: Member, request: DoorRequest, moved: DoorsMoved | BaseException
+    ) -> list[ServerMessage]:
+        if member not in self.audience.members:
+            return []  # it has left
+        if isinstance(moved, BaseException):
+            _logger.error("doors could not be moved", exc_info=moved)
+            return self.audience.collect(member, member.session.leave_doors(request))
+        member.session.adopt_doors(moved)
+        return []
 
     def _take_answer(
         self, member: Member, request: IrRequest, computed: ComputedResponse | BaseException

@@ -25,6 +25,7 @@ MESSAGES = [
     " [0, -10, -20]]}}",
     '{"type": "move_emitter", "id": "a", "position": [1, 1, 1], "pose_id": 7}',
     '{"type": "set_gain", "id": "a", "gain_db": 3.5}',
+    '{"type": "set_door", "door": "kitchen", "openness": 0.5}',
     '{"type": "set_level", "level": "auto"}',
     '{"type": "set_effects", "effects": {"directivity": true, "hrtf": null}}',
     '{"type": "stop_emitter", "id": "a", "stop_at": 4800, "fade_s": 0.5}',

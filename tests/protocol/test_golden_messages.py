@@ -34,6 +34,8 @@ OF_CLIENTS = [
     '{"type": "move_emitter", "id": "a", "position": [1, 1, 1], "pose_id": 7}',
     '{"type": "move_emitter", "id": "a", "position": [1, 1, 1], "orientation": [0, 0, 1, 0], "pose_id": 4294967295}',
     '{"type": "set_gain", "id": "a", "gain_db": 3.5, "ramp_s": 0.5}',
+    '{"type": "set_door", "door": "kitchen", "openness": 0.25}',
+    '{"type": "hello", "protocol": 3, "scene": "flat", "doors": {"kitchen": 1.0, "hall": 0}}',
     '{"type": "set_level", "level": "auto"}',
     '{"type": "set_effects", "effects": {"air_absorption": true, "diffraction": null}, "output": "headphones"}',
     '{"type": "remove_emitter", "id": "a"}',
@@ -66,8 +68,14 @@ _WELCOME = (
     ' "hrtf": "kemar", "level": "fine", "max_emitters": 16}'
 )
 _TIMES = '{"p50": 1.5, "p99": 2.5, "p99_9": null}'
+_DOOR = (
+    '{"name": "kitchen", "kind": "swing", "pivot": [5, 1, 0], "angle_deg": 90.0, "slide_m": [0, 1, 0], "openness": 1.0,'
+    ' "footprint": [[5, 1], [5, 2]], "bottom_m": 0.0, "top_m": 2.0}'
+)
 OF_THE_SERVER = [
     _WELCOME,
+    _WELCOME.replace('"listener": {', '"is_mesh": true, "doors": [' + _DOOR + '], "listener": {')[:-1]
+    + ', "doors": {"kitchen": 0.5}}',
     _WELCOME.replace('"channels": 2, "encoding": "f32"', '"channels": 9, "encoding": "opus"')[:-1]
     + ', "order": 2, "opus": {"frame_samples": 240, "look_ahead": 60, "streams": [2, 2, 2, 2, 1]}}',
     _WELCOME[:-1] + ', "resume_token": "6f1a", "resume_s": 30.0, "resumed": {"sample_clock": 4096, "sequence": 8,'

@@ -318,6 +318,11 @@ class SimulatedSession:
         self._plans, self._next_plan_s = True, self.clock_s + max(0.5, min(2.0, self._plan_interval_s))
         return _Plan()
 
+    levels = None
+
+    def take_door_requests(self) -> list:
+        return []
+
     def adopt(self, _plan: object) -> list:
         self._plans = False
         return []

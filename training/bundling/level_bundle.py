@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 from server.scene.bundle import MOST_TRIANGLES, Bundle, write_bundle
+from server.scene.door import MOST_DOORS, Door
 from server.scene.limits import MOST_SAMPLES
 from server.scene.manifest import (
     MESH_FORMAT,
@@ -25,13 +26,18 @@ _SHORTEST_S, _AFTER_S = 0.25, 0.05
 
 
 def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
-    """Write the bundle, with doors as they stand, and load it back. Raises SceneFileError for more triangles than a
+    """Write the bundle, whose doors move, and load it back. Raises SceneFileError for more triangles or doors than a
     bundle may have, and for a start that is not in the air."""
     place = scene.place
     if len(place.mesh.triangles) > MOST_TRIANGLES:
         raise SceneFileError(
             f"{scene.id}: geometry.mesh: {len(place.mesh.triangles):,} triangles with its doors, and a bundle has at "
             f"most {MOST_TRIANGLES:,}: import the level with a larger --merge-within-m, or with less detail"
+        )
+    if len(scene.doors) > MOST_DOORS:
+        raise SceneFileError(
+            f"{scene.id}: geometry.doors: {len(scene.doors)}, and a bundle has at most {MOST_DOORS}: leave those that "
+            "never move in the mesh, under another name than door_..."
         )
     for name, position in (("listener", scene.file.start.listener), ("emitter", scene.file.start.emitter)):
         if not scene.surroundings.holds(position):
@@ -40,12 +46,21 @@ def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
     (west, south, low), (east, north, high) = place.mesh.bounds_m.tolist()
     longest_s = 2 * math.dist((west, south, low), (east, north, high)) / SPEED_OF_SOUND + _AFTER_S
     samples = _HOP * math.ceil(max(_SHORTEST_S, longest_s) * _SAMPLE_RATE / _HOP)
+    leaves, _ = scene.leaves
+    doors = [Door(**door.model_dump(exclude={"surface_mass_kg_m2"})) for door in scene.file.geometry.doors]
+    files = {MESH_FILE: scene.mesh.to_bytes()}
+    files |= {door.mesh: leaf.mesh.to_bytes() for door, leaf in zip(doors, leaves, strict=True)}
     manifest = Manifest(
         format_version=MESH_FORMAT,
         id=scene.id,
         name=scene.file.name,
         description=scene.file.description,
-        mesh=SceneMesh(file=MESH_FILE, materials=dict(place.materials), open_sky=scene.file.geometry.open_sky),
+        mesh=SceneMesh(
+            file=MESH_FILE,
+            materials=dict(place.materials),
+            open_sky=scene.file.geometry.open_sky,
+            doors=tuple(doors),
+        ),
         bounds=Bounds(minimum=(west, south, low), maximum=(east, north, high)),
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,
@@ -63,6 +78,6 @@ def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
         ),
         fields={},
         levels=(QualityLevel(name="geometry", field=NO_FIELD),),
-        files={MESH_FILE: "0" * 64},
+        files=dict.fromkeys(files, "0" * 64),
     )
-    return write_bundle(folder, manifest, {MESH_FILE: place.mesh.to_bytes()})
+    return write_bundle(folder, manifest, files)

@@ -42,6 +42,7 @@ MESSAGES = (
     {"type": "add_emitter", "id": "b", "live": True, "position": [6, 3, 1.5], "directivity": {"pattern": "cardioid"}},
     {"type": "move_emitter", "id": "a", "position": [1, 1, 1], "pose_id": 7},
     {"type": "set_gain", "id": "a", "gain_db": 3.5},
+    {"type": "set_door", "door": "kitchen", "openness": 0.5},
     {"type": "set_level", "level": "auto"},
     {"type": "set_effects", "effects": {"directivity": True}},
     {"type": "stop_emitter", "id": "a", "stop_at": 4_800},

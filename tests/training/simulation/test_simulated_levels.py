@@ -16,7 +16,7 @@ from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
 from training.data.dataset import Dataset, DatasetError
-from training.data.levels.level_scene import Door, LevelFile, LevelGeometry, LevelScene, read_scene
+from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene, SceneDoor, read_scene
 from training.data.levels.probe_places import floors_of, probe_places
 from training.data.scene_file import SceneFile, SceneFileError
 from training.parallel.jobs import open_jobs
@@ -207,7 +207,7 @@ def leaf():
 
 
 def door(openness, **changes):
-    return Door(
+    return SceneDoor(
         **{
             "name": "middle", "mesh": "door0.npz", "kind": "swing", "pivot": (4.1, 2.0, 0.0), "angle_deg": 90.0,
             "slide_m": (0.0, 1.0, 0.0), "openness": openness, "surface_mass_kg_m2": 12.0, **changes,

@@ -6,6 +6,7 @@ triangles of emitters, of the listener's start and of spawn areas say where thes
 """
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from server.acoustics.mesh import LONGEST_NAME
+from server.scene.door import DOOR_NAME
 from server.scene.geometry import Finite, Strict
 from training.data.levels.axis_options import Handedness, Units, Up
 from training.data.levels.level_source import LevelError, LevelSource, Node, Part
@@ -287,6 +289,11 @@ def _joined(parts: list[Part], materials: list[int], to_world: _Floats) -> Surfa
 def _door(path: Path, each: _Labelled, surfaces: Surfaces, pivot: _Point, to_world: _Floats) -> LevelDoor:
     if not len(surfaces.triangles):
         raise LevelError(path, each.node.name, "this door has no triangles: give it its leaf, shut")
+    if not re.fullmatch(DOOR_NAME, each.name):
+        problem = (
+            f"{each.name!r} is no name for a door: give it up to 64 characters, without : , = / and no blank first"
+        )
+        raise LevelError(path, each.node.name, problem)
     extras = each.extras
     if extras.slide is not None:
         slide = _point(to_world @ each.node.to_file[:3, :3] @ np.array(extras.slide))

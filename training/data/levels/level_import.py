@@ -21,11 +21,11 @@ from training.data.levels.level import GLTF_AXES, Axes, Level, level_of
 from training.data.levels.level_scene import (
     MESH_FILE,
     SCENE_FILE,
-    Door,
     EmitterPlace,
     LevelFile,
     LevelGeometry,
     LevelScene,
+    SceneDoor,
     SpawnArea,
 )
 from training.data.levels.level_source import LevelError, LevelSource
@@ -238,7 +238,7 @@ def _file(
     is_open: bool,
 ) -> LevelFile:
     doors = tuple(
-        Door(
+        SceneDoor(
             name=door.name,
             mesh=f"door{index}.npz",
             kind=door.kind,

@@ -5,24 +5,25 @@ are above the floor that is below them. Doors stand as they are at the beginning
 """
 
 import json
-import math
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, count
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError, model_validator
 
+from server.acoustics.doors import DoorLeaf
 from server.acoustics.geometry import Points
 from server.acoustics.mesh import LONGEST_NAME, MeshError, TriangleMesh
 from server.acoustics.sound_path import SoundPathFinder
 from server.acoustics.surroundings import MeshSurroundings
-from server.scene.geometry import Finite, Material, Point, Strict
+from server.scene.door import Door
+from server.scene.geometry import Material, Point, Strict
 from server.scene.manifest import Air, Start
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.levels.probe_places import probe_places
@@ -34,27 +35,10 @@ _Floats = npt.NDArray[np.float64]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+\.npz$")]
 
 
-class Door(Strict):
-    """A leaf, as it is when shut, in the file `mesh`. A swing turns by `angle_deg` about the upright line through
-    `pivot`, counter-clockwise as seen from above, when it opens; a slide moves by `slide_m`. `openness` is that at the
-    beginning, 0 shut and 1 open. The mass decides what goes through; without one, its materials' do."""
+class SceneDoor(Door):
+    """A door of a level. The mass decides what goes through its leaf; without one, its materials' do."""
 
-    name: Annotated[str, Field(min_length=1)]
-    mesh: _FileName
-    kind: Literal["swing", "slide"]
-    pivot: Point
-    angle_deg: Finite
-    slide_m: Point
-    openness: Annotated[float, Field(ge=0, le=1)]
     surface_mass_kg_m2: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
-
-    def moved(self, vertices_m: _Floats) -> _Floats:
-        """(V, 3) vertices of the shut leaf where they are at the door's openness."""
-        if self.kind == "slide":
-            return vertices_m + self.openness * np.array(self.slide_m)
-        angle = math.radians(self.openness * self.angle_deg)
-        turn = np.array([(math.cos(angle), -math.sin(angle), 0), (math.sin(angle), math.cos(angle), 0), (0, 0, 1)])
-        return np.asarray((vertices_m - self.pivot) @ turn.T + self.pivot, dtype=np.float64)
 
 
 class EmitterPlace(Strict):
@@ -77,7 +61,7 @@ class LevelGeometry(Strict):
     mesh: _FileName
     materials: Annotated[dict[str, Material], Field(min_length=1)]
     open_sky: bool = False
-    doors: tuple[Door, ...] = ()
+    doors: tuple[SceneDoor, ...] = ()
     emitters: tuple[EmitterPlace, ...] = ()
     spawns: tuple[SpawnArea, ...] = ()
 
@@ -126,9 +110,17 @@ class LevelScene:
     @cached_property
     def place(self) -> MeshGeometry:
         """All surfaces, with the leaves of doors where they stand."""
+        leaves, materials = self.leaves
+        at = [leaf.at(door.openness) for leaf, door in zip(leaves, self.file.geometry.doors, strict=True)]
+        mesh = TriangleMesh.joined([self.mesh, *at])
+        return MeshGeometry(mesh, {name: materials[name] for name in mesh.materials})
+
+    @cached_property
+    def leaves(self) -> tuple[tuple[DoorLeaf, ...], Mapping[str, Material]]:
+        """The leaves of the doors, and all materials. A door with a mass has materials of its own."""
         known = self.file.geometry.materials
         materials = {name: known[name] for name in self.mesh.materials}
-        vertices, triangles, surfaces = [self.mesh.vertices_m], [self.mesh.triangles], [self.mesh.surfaces]
+        leaves = []
         for door, leaf in zip(self.file.geometry.doors, self.doors, strict=True):
             names = []
             for name in leaf.materials:
@@ -139,14 +131,9 @@ class LevelScene:
                     material = known[name].model_copy(update={"surface_mass_kg_m2": door.surface_mass_kg_m2})
                 materials[own] = material
                 names.append(own)
-            numbers = np.array([list(materials).index(name) for name in names])
-            triangles.append(leaf.triangles + sum(map(len, vertices)))
-            vertices.append(door.moved(leaf.vertices_m))
-            surfaces.append(numbers[leaf.surfaces])
-        mesh = TriangleMesh(
-            np.concatenate(vertices), np.concatenate(triangles), np.concatenate(surfaces), tuple(materials)
-        )
-        return MeshGeometry(mesh, materials)
+            own_mesh = TriangleMesh(leaf.vertices_m, leaf.triangles, leaf.surfaces, tuple(names))
+            leaves.append(DoorLeaf(own_mesh, door.motion))
+        return tuple(leaves), materials
 
     @cached_property
     def surroundings(self) -> MeshSurroundings:

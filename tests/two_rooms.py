@@ -1,0 +1,102 @@
+"""Two rooms with a door between them: as a mesh with a leaf, and as a scene bundle."""
+
+from pathlib import Path
+
+import numpy as np
+
+from server.acoustics.doors import DoorLeaf, LeafMotion, MeshWithDoors
+from server.acoustics.mesh import TriangleMesh
+from server.scene.bundle import Bundle, write_bundle
+from server.scene.geometry import Geometry, Material, Materials
+from server.scene.manifest import Manifest
+from server.scene.mesh_geometry import MeshGeometry
+
+HEIGHT_M = 2.8
+WEST, EAST = (1.5, 1.0, 1.5), (6.5, 4.0, 1.5)
+"""Places in the two rooms. Neither sees the other, wherever the door is."""
+BEFORE, BEHIND = (2.5, 2.45, 1.5), (5.5, 2.45, 1.5)
+"""Places that see each other through the open door."""
+HARD = Material(absorption=(0.1,) * 7, scattering=(0.1,) * 7)
+WOOD = Material(absorption=(0.1,) * 7, scattering=(0.1,) * 7, surface_mass_kg_m2=10.0)
+SWING = LeafMotion("swing", (4.05, 2.0, 0.0), 90.0, (0.0, 0.9, 0.0))
+SLIDE = LeafMotion("slide", (4.05, 2.0, 0.0), 90.0, (0.0, 0.9, 0.0))
+_CORNERS = (
+    *((0.0, 0.0), (4.0, 0.0), (4.0, 2.0), (4.15, 2.0), (4.15, 0.0), (8.0, 0.0)),
+    *((8.0, 5.0), (4.15, 5.0), (4.15, 2.9), (4.0, 2.9), (4.0, 5.0), (0.0, 5.0)),
+)
+
+
+def rooms() -> MeshGeometry:
+    """Without the leaf."""
+    materials = Materials(walls=HARD, floor=HARD, ceiling=HARD)
+    return MeshGeometry.of_plan(Geometry(height_m=HEIGHT_M, corners=_CORNERS, materials=materials))
+
+
+def box(low, high, material: str) -> TriangleMesh:
+    """A closed box whose faces look outwards."""
+    corners = np.array([[(low, high)[index >> axis & 1][axis] for axis in range(3)] for index in range(8)], np.float64)
+    quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+    triangles = [(a, b, c) for a, b, c, _ in quads] + [(a, c, d) for a, _, c, d in quads]
+    return TriangleMesh(corners, np.array(triangles, np.int32), np.zeros(12, np.int32), (material,))
+
+
+def leaf() -> TriangleMesh:
+    """As it is when shut: from wall to wall, and from the floor to the ceiling."""
+    return box((4.05, 2.0, 0.0), (4.1, 2.9, HEIGHT_M), "wood")
+
+
+def moving(motion: LeafMotion = SWING) -> MeshWithDoors:
+    return MeshWithDoors(rooms().mesh, [DoorLeaf(leaf(), motion)])
+
+
+def door(motion: LeafMotion = SWING, name: str = "between", mesh: str = "door0.npz", openness: float = 1.0) -> dict:
+    """As it is in a manifest."""
+    return {
+        "name": name,
+        "mesh": mesh,
+        "kind": motion.kind,
+        "pivot": motion.pivot,
+        "angle_deg": motion.angle_deg,
+        "slide_m": motion.slide_m,
+        "openness": openness,
+    }
+
+
+def document(doors: list[dict], **changes) -> dict:
+    """A manifest without a field, at 24 kHz."""
+    materials = {**rooms().materials, "wood": WOOD}
+    names = ["geometry.npz", *(each["mesh"] for each in doors)]
+    return {
+        "format_version": 4,
+        "id": "two-rooms",
+        "name": "Two rooms",
+        "mesh": {
+            "file": "geometry.npz",
+            "materials": {name: material.model_dump() for name, material in materials.items()},
+            "doors": doors,
+        },
+        "bounds": {"minimum": (0.0, 0.0, 0.0), "maximum": (8.0, 5.0, HEIGHT_M)},
+        "speed_of_sound": 343.0,
+        "image_order": 1,
+        "transmission": True,
+        "start": {"listener": WEST, "emitter": EAST},
+        "codec": {
+            "sample_rate": 24_000,
+            "n_fft": 256,
+            "hop": 64,
+            "samples": 6_144,
+            "lead_samples": 0,
+            "known_frames": 0,
+            "log_floor": 1e-3,
+        },
+        "fields": {},
+        "levels": [{"name": "geometry", "field": "none"}],
+        "files": dict.fromkeys(names, "0" * 64),
+        **changes,
+    }
+
+
+def write_two_rooms(folder: Path, motion: LeafMotion = SWING, *, openness: float = 1.0) -> Bundle:
+    given = document([door(motion, openness=openness)])
+    files = {"geometry.npz": rooms().mesh.to_bytes(), "door0.npz": leaf().to_bytes()}
+    return write_bundle(folder, Manifest.model_validate(given), files)
