@@ -165,7 +165,7 @@ def test_the_command_takes_an_address(cluster, dataset, tiny_scene, tmp_path):
         dataset.seed,
     ]
     done = subprocess.run(
-        [str(part) for part in [*command, "--seed", dataset.seed, "--cluster", cluster.address]],
+        [str(part) for part in [*command, "--cluster", cluster.address]],
         capture_output=True,
         text=True,
         check=False,
