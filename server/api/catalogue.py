@@ -14,7 +14,7 @@ from server.core.errors import BundleError
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.codecs import libopus
 from server.protocol.codecs.registry import CODECS, OPUS_MEANING
-from server.protocol.server_messages import DoorDescription, Place, SceneDescription
+from server.protocol.server_messages import DoorDescription, Place, SceneDescription, Storey
 from server.scene.bundle import MANIFEST_FILE, Bundle, bundled_scenes
 from server.scene.door import Door
 from server.scene.outline import hull_in_plan
@@ -96,6 +96,14 @@ def _describe_door(door: Door, leaf: TriangleMesh) -> DoorDescription:
     )
 
 
+def _storeys(bundle: Bundle) -> tuple[Storey, ...]:
+    floors_m = bundle.floors_m
+    if bundle.mesh is None or not floors_m:
+        return ()
+    tops_m = (*floors_m[1:], float(bundle.mesh.bounds_m[1, 2]))
+    return tuple(Storey(floor_m=round(low, 3), top_m=round(top, 3)) for low, top in zip(floors_m, tops_m, strict=True))
+
+
 def describe_scene(levels: FieldsByLevel) -> SceneDescription:
     field, manifest = levels.at_rate(None).default, levels.bundle.manifest
     start, plan = manifest.start, levels.bundle.floor_plan
@@ -114,6 +122,7 @@ def describe_scene(levels: FieldsByLevel) -> SceneDescription:
         height_m=plan.height_m - plan.floor_m,
         openings=() if manifest.geometry is None else manifest.geometry.openings,
         is_mesh=manifest.mesh is not None,
+        storeys=_storeys(levels.bundle),
         doors=tuple(map(_describe_door, levels.bundle.doors, _leaves(levels.bundle))),
         listener=Place(position=start.listener, yaw=math.radians(start.listener_yaw_deg)),
         emitter=Place(position=start.emitter),

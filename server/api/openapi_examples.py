@@ -71,6 +71,7 @@ def answer_examples() -> dict[str, Any]:
             "channels": ["left", "right"],
             "samples": [[0.0, 0.0, 0.0021], [0.0, 0.0, 0.0013]],
         },
+        "/v1/scenes/{scene}/section": {"height_m": 1.3, "lines": [[0.0, 0.0, 8.0, 0.0], [8.0, 0.0, 8.0, 5.0]]},
         "/v1/scenes/{scene}/loudness": {
             "levels_db": [[-9.54, -8.0], [None, -6.02]],
             "origin": [-1.0, -1.0],

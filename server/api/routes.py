@@ -26,6 +26,7 @@ from server.api.frontier import Frontier
 from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, AskedStream, SettledStream, merged
 from server.api.ranged_files import RangedBytes, RangedFile
 from server.api.response_cache import Compute, Kind
+from server.api.section import Section
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
 from server.assets.clip_store import is_upload
@@ -363,6 +364,17 @@ async def loudness(
     parameters = {"emitter": position, "height_m": height_m, "spacing_m": spacing_m}
     media_type = "image/png" if format == "png" else "application/json"
     return await _cached(request, entity_tag(field, "loudness", parameters, format), media_type, draw, kind="map")
+
+
+@api.get("/scenes/{scene}/section")
+async def scene_section(
+    request: Request,
+    scene: ScenePath,
+    height_m: Annotated[Number, Query(**_between(-1_000, 1_000), description="of the plane")] = 1.3,
+) -> Section:
+    """The lines in which a horizontal plane cuts the scene, to draw it from above; doors are left out."""
+    bundle = _levels(request, scene).bundle
+    return await anyio.to_thread.run_sync(Section.of, bundle, height_m)
 
 
 @api.get("/scenes/{scene}/plan", response_model=PlanDocument)

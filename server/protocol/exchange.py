@@ -46,6 +46,7 @@ from server.protocol.server_messages import (
     ServerMessage,
     SnapshotTaken,
     Status,
+    Storey,
     Welcome,
 )
 from server.scene.geometry import Opening
@@ -98,6 +99,7 @@ _STUDIO: Final = SceneDescription(
     height_m=2.8,
     openings=(Opening(name="door", start=(5.0, 1.0), end=(5.0, 2.0)),),
     is_mesh=True,
+    storeys=(Storey(floor_m=0.0, top_m=2.8),),
     doors=(
         DoorDescription(
             name="booth",

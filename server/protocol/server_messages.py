@@ -39,14 +39,22 @@ class DoorDescription(Message):
     top_m: float
 
 
+class Storey(Message):
+    """A storey: its floor, and where the next one begins or the scene ends."""
+
+    floor_m: float
+    top_m: float
+
+
 class SceneDescription(Message):
     """Description of a scene. `corners` is the floor plan, counter-clockwise, or the outline of the bounds if the walls
     are unknown. `sample_rate` is that of the scene's fields and of single responses, and a stream may have any of
     `sample_rates`. `channels` are those of the scene's responses: two ears or one microphone. `directional_levels` are
     the quality levels that know from where sound arrives, so that a stream of them may be ambisonic.
 
-    `is_mesh` says that its surfaces are a triangle mesh, of which `corners` are the outline of the bounds. `doors` can
-    be opened and shut; `footprint` is where the leaf stands when shut, seen from above.
+    `is_mesh` says that its surfaces are a triangle mesh, of which `corners` are the outline of the bounds. Its
+    `storeys` are from below; GET /v1/scenes/{scene}/section has the lines in which a plane cuts it at a height. `doors`
+    can be opened and shut; `footprint` is where the leaf stands when shut, seen from above.
 
     `listener` and `emitter` are the places where a visit begins. `accepted_laws` are the laws of `nafir check` that the
     scene's fields break, each with the reason why the scene is offered all the same.
@@ -66,6 +74,7 @@ class SceneDescription(Message):
     height_m: float
     openings: tuple[Opening, ...]
     is_mesh: Annotated[bool, Field(exclude_if=lambda is_mesh: not is_mesh)] = False
+    storeys: Annotated[tuple[Storey, ...], Field(exclude_if=lambda storeys: not storeys)] = ()
     doors: Annotated[tuple[DoorDescription, ...], Field(exclude_if=lambda doors: not doors)] = ()
     listener: Place
     emitter: Place

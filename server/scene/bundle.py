@@ -25,6 +25,7 @@ from pydantic import ValidationError
 from server.acoustics.doors import DoorLeaf, MeshWithDoors, Openness
 from server.acoustics.geometry import FloorPlan, Vector3
 from server.acoustics.mesh import MeshError, TriangleMesh
+from server.acoustics.mesh_plan import floors_of
 from server.acoustics.surroundings import MeshSurroundings, PlanSurroundings, Surroundings
 from server.core.errors import BundleError, RequestError
 from server.core.json_keys import DoubledKeyError, require_distinct_keys
@@ -163,6 +164,11 @@ class Bundle:
         for name, position in (("listener", manifest.start.listener), ("emitter", manifest.start.emitter)):
             if not self.holds(position):
                 raise BundleError(path, f"start.{name}", "is not in the air: the mesh has it inside a wall or outside")
+
+    @cached_property
+    def floors_m(self) -> tuple[float, ...]:
+        """Heights of the floors of a mesh, from below; empty for a floor plan."""
+        return () if self.mesh is None else tuple(floors_of(self.mesh))
 
     def holds(self, position: Vector3) -> bool:
         """Whether a point is in the air. Leaves of doors do not count."""

@@ -203,3 +203,17 @@ def test_commands_take_doors(bundle, tmp_path):
     refused = run("plan", "--door", "attic=1")
     assert refused.exit_code != 0
     assert "no door 'attic'" in str(refused.exception)
+
+
+def test_a_section_has_the_lines_at_a_height_without_doors(client):
+    lines = np.array(client.get("/v1/scenes/two-rooms/section", params={"height_m": 1.0}).json()["lines"])
+    assert lines.shape[1] == 4
+    assert lines.min() == 0.0
+    assert lines[:, [0, 2]].max() == 8.0
+    assert not np.any((lines[:, 0] == 4.05) | (lines[:, 2] == 4.05))
+    assert client.get("/v1/scenes/two-rooms/section", params={"height_m": 9.0}).json()["lines"] == []
+    assert client.get("/v1/scenes/two-rooms/section", params={"height_m": "nan"}).status_code == 422
+
+
+def test_a_description_has_its_storeys(client):
+    assert client.get("/v1/scenes/two-rooms").json()["storeys"] == [{"floor_m": 0.0, "top_m": 2.8}]

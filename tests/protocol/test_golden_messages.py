@@ -74,7 +74,10 @@ _DOOR = (
 )
 OF_THE_SERVER = [
     _WELCOME,
-    _WELCOME.replace('"listener": {', '"is_mesh": true, "doors": [' + _DOOR + '], "listener": {')[:-1]
+    _WELCOME.replace(
+        '"listener": {',
+        '"is_mesh": true, "storeys": [{"floor_m": 0, "top_m": 2.6}], "doors": [' + _DOOR + '], "listener": {',
+    )[:-1]
     + ', "doors": {"kitchen": 0.5}}',
     _WELCOME.replace('"channels": 2, "encoding": "f32"', '"channels": 9, "encoding": "opus"')[:-1]
     + ', "order": 2, "opus": {"frame_samples": 240, "look_ahead": 60, "streams": [2, 2, 2, 2, 1]}}',

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from server.acoustics.decibels import power_to_db
 from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_plan import floors_of
 from server.acoustics.surroundings import MeshSurroundings
 from server.scene.bundle import Bundle
 from server.scene.geometry import Material
@@ -17,7 +18,7 @@ from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
 from training.data.dataset import Dataset, DatasetError
 from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene, SceneDoor, read_scene
-from training.data.levels.probe_places import floors_of, probe_places
+from training.data.levels.probe_places import probe_places
 from training.data.scene_file import SceneFile, SceneFileError
 from training.parallel.jobs import open_jobs
 from training.simulation.direct_paths import DirectPaths

@@ -1,53 +1,18 @@
-"""Places of probes in a level: on a jittered grid above each floor.
-
-A floor is the surfaces that face up at one height, if they are large enough; the tops of tables are none. Metres.
-"""
+"""Places of probes in a level: on a jittered grid above each floor. Metres."""
 
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_plan import SAME_FLOOR_M, floors_of
 from server.acoustics.surroundings import MeshSurroundings
 from training.data.scene_file import CELLS_PER_BATCH, MOST_CELLS, Probes, SceneFileError
 
 _Floats = npt.NDArray[np.float64]
 
-_UPRIGHT = 0.9
-"""The least vertical component of a floor's normal."""
-_SAME_FLOOR_M = 0.1
-"""From the lowest to the highest surface of a floor."""
-_STEP_M = 0.01
-_LEAST_M2, _LEAST_SHARE = 1.0, 0.2
-"""The least area of a floor, and its least share of the largest one's."""
 _DRAWS_PER_CELL = 32
 _ABOVE_GROUND_M = 0.3
 """Under a probe is its floor, or what stands on it, or what lies no farther below it; elsewhere there is a void, or
 another floor."""
-
-
-def floors_of(mesh: TriangleMesh) -> list[float]:
-    """Heights of the floors, from below. Ramps and stairs that join floors are none, unless they have as much area
-    within _SAME_FLOOR_M as a floor has."""
-    level = mesh.normals[:, 2] > _UPRIGHT
-    heights, areas = mesh.corners_m[level, :, 2].mean(axis=-1), mesh.areas_m2[level]
-    # In steps, so that the work is bounded by the heights and not by the triangles.
-    steps, step_of = np.unique(np.rint(heights / _STEP_M), return_inverse=True)
-    ends = np.searchsorted(steps, steps + round(_SAME_FLOOR_M / _STEP_M), side="right")
-    left = np.bincount(step_of, weights=areas, minlength=len(steps))
-    floors: list[float] = []
-    least = _LEAST_M2
-    while len(steps):
-        sums = np.concatenate([[0.0], np.cumsum(left)])
-        sizes = sums[ends] - sums[:-1]
-        begin = int(np.argmax(sizes))
-        if sizes[begin] < least:
-            break
-        if not floors:
-            least = max(_LEAST_M2, _LEAST_SHARE * float(sizes[begin]))
-        own = (step_of >= begin) & (step_of < ends[begin]) & (left[step_of] > 0)
-        floors.append(float(np.average(heights[own], weights=areas[own])))
-        left[begin : ends[begin]] = 0.0
-    return sorted(floors)
 
 
 def probe_places(surroundings: MeshSurroundings, probes: Probes, rng: np.random.Generator) -> _Floats:
@@ -65,7 +30,7 @@ def probe_places(surroundings: MeshSurroundings, probes: Probes, rng: np.random.
     for below_m, floor_m, next_m in zip([-np.inf, *floors], floors, [*floors[1:], np.inf], strict=False):
         # Ground between two floors is the lower one's, where that has probes so far up.
         is_shared = below_m + probes.heights_m[1] > floor_m - _ABOVE_GROUND_M
-        least_m = floor_m - (_SAME_FLOOR_M if is_shared else _ABOVE_GROUND_M)
+        least_m = floor_m - (SAME_FLOOR_M if is_shared else _ABOVE_GROUND_M)
         for begin in range(0, len(centres), CELLS_PER_BATCH):
             some = centres[begin : begin + CELLS_PER_BATCH]
             draws = np.empty((len(some), _DRAWS_PER_CELL, 3))
@@ -74,7 +39,7 @@ def probe_places(surroundings: MeshSurroundings, probes: Probes, rng: np.random.
             flat = draws.reshape(-1, 3)
             clear = surroundings.contains(flat) & (surroundings.tree.distance_m(flat) >= probes.wall_clearance_m)
             ground_m = flat[:, 2] - surroundings.tree.closest(flat, np.array([0.0, 0.0, -1.0])).distance
-            clear &= (ground_m >= least_m) & (ground_m < next_m - _SAME_FLOOR_M)
+            clear &= (ground_m >= least_m) & (ground_m < next_m - SAME_FLOOR_M)
             by_cell = clear.reshape(draws.shape[:2])
             # Each cell takes its first draw that is clear.
             found.append(draws[np.arange(len(some)), np.argmax(by_cell, axis=1)][by_cell.any(axis=1)])
