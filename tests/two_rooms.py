@@ -11,7 +11,7 @@ from server.scene.geometry import Geometry, Material, Materials
 from server.scene.manifest import Manifest
 from server.scene.mesh_geometry import MeshGeometry
 
-HEIGHT_M = 2.8
+HEIGHT_M, STOREY_M = 2.8, 3.0
 WEST, EAST = (1.5, 1.0, 1.5), (6.5, 4.0, 1.5)
 """Places in the two rooms. Neither sees the other, wherever the door is."""
 BEFORE, BEHIND = (2.5, 2.45, 1.5), (5.5, 2.45, 1.5)
@@ -96,7 +96,14 @@ def document(doors: list[dict], **changes) -> dict:
     }
 
 
-def write_two_rooms(folder: Path, motion: LeafMotion = SWING, *, openness: float = 1.0) -> Bundle:
-    given = document([door(motion, openness=openness)])
-    files = {"geometry.npz": rooms().mesh.to_bytes(), "door0.npz": leaf().to_bytes()}
+def write_two_rooms(
+    folder: Path, motion: LeafMotion = SWING, *, openness: float = 1.0, has_upper_storey: bool = False
+) -> Bundle:
+    """With an upper storey, the same rooms are there once more above the others."""
+    given, mesh = document([door(motion, openness=openness)]), rooms().mesh
+    if has_upper_storey:
+        raised = mesh.vertices_m + np.array((0.0, 0.0, STOREY_M))
+        mesh = TriangleMesh.joined([mesh, TriangleMesh(raised, mesh.triangles, mesh.surfaces, mesh.materials)])
+        given["bounds"] = {"minimum": (0.0, 0.0, 0.0), "maximum": (8.0, 5.0, STOREY_M + HEIGHT_M)}
+    files = {"geometry.npz": mesh.to_bytes(), "door0.npz": leaf().to_bytes()}
     return write_bundle(folder, Manifest.model_validate(given), files)

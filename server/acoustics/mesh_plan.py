@@ -62,4 +62,5 @@ def section(mesh: TriangleMesh, height_m: float) -> _Floats:
         share = heights[rows, lone] / (heights[rows, lone] - heights[rows, other])
         ends.append(corners[rows, lone] + share[:, None] * (corners[rows, other] - corners[rows, lone]))
     lines: _Floats = np.stack(ends, axis=1)[..., :2]
-    return lines[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1) >= _SHORTEST_M]
+    are_long = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1) >= _SHORTEST_M
+    return np.asarray(lines[are_long])

@@ -41,6 +41,7 @@ from server.rendering.head_decoder import ORDERS, HeadDecoder
 from server.responses.decoder_file import DECODER_FORMATS, DECODER_MEDIA_TYPES, DecoderFile, parse_decoder_format
 from server.responses.full_response import FullResponse
 from server.responses.impulse_response import (
+    DOOR_PATTERN,
     IR_FORMATS,
     IR_OUTPUTS,
     MEDIA_TYPES,
@@ -49,6 +50,7 @@ from server.responses.impulse_response import (
     ImpulseResponse,
     IrQuery,
     entity_tag,
+    parse_doors,
     parse_format,
     parse_position,
     require_directions,
@@ -60,7 +62,7 @@ from server.runtime.pace import Checkpoint
 from server.runtime.racing import StoppedError, run_until
 from server.runtime.traces import span
 from server.scene.bundle import Bundle
-from server.scene.door import DOOR_PATTERN, MOST_DOORS, parse_doors, read_openness
+from server.scene.door import MOST_DOORS, read_openness
 from server.scene.manifest_schema import manifest_schema
 
 MAX_MAP_SPACING_M = 20.0

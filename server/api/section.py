@@ -1,9 +1,9 @@
 """What a scene looks like from above: the lines in which a horizontal plane cuts it."""
 
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from server.acoustics.mesh_plan import section
 from server.scene.bundle import Bundle
@@ -18,7 +18,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     height_m: float
-    lines: tuple[tuple[float, float, float, float], ...]
+    lines: tuple[Annotated[tuple[float, ...], Field(min_length=4, max_length=4)], ...]
 
     @classmethod
     def of(cls, bundle: Bundle, height_m: float) -> Self:

@@ -510,7 +510,8 @@ def protocol() -> None:
 
 
 def _with_doors(bundle: "Bundle", door: list[str] | None) -> "Bundle":
-    from server.scene.door import parse_doors, read_openness
+    from server.responses.impulse_response import parse_doors
+    from server.scene.door import read_openness
 
     return bundle.with_doors(read_openness(bundle.doors, parse_doors(door or ())))
 

@@ -8,24 +8,26 @@ the left ear and the right one; or the harmonics of an ambisonic response (ACN, 
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal, TypedDict, Unpack, get_args
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from server.acoustics.geometry import Pose, Quaternion, Vector3, orientations_of
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER, harmonic_count
 from server.assets.hrtfs import DEFAULT_HRTF
 from server.core.entity_tags import computed_tag
 from server.core.errors import RequestError
-from server.core.numerals import DECIMAL, ZERO, parse_schema_decimal
+from server.core.numerals import DECIMAL, ZERO, parse_decimal, parse_schema_decimal
 from server.core.wav import wav_bytes
 from server.field.field import AcousticField
 from server.rendering.hrtf import HeadFilters, kemar
 from server.responses.full_response import FullResponse
 from server.scene.bundle import Bundle
+from server.scene.door import OpenShare
 
 IrFormat = Literal["wav", "npy", "json", "sofa"]
 IR_FORMATS: tuple[IrFormat, ...] = get_args(IrFormat)
@@ -46,6 +48,26 @@ ORIENTATION_PATTERN = (
     rf"^(?! *{ZERO} *, *{ZERO} *, *{ZERO} *, *{ZERO} *$) *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *, *{DECIMAL} *$"
 )
 """The texts that `parse_orientation` accepts, as a regular expression of JSON Schema."""
+DOOR_PATTERN = r"^[^\s:,=/][^:,=/]{0,63}=(0|1|0?\.[0-9]{1,9}|[01]\.0{0,9})$"
+"""Texts that `parse_doors` accepts, as a regular expression of JSON Schema. It accepts other forms of numbers too."""
+_OPEN_SHARE: TypeAdapter[float] = TypeAdapter(OpenShare)
+
+
+def parse_doors(texts: Iterable[str]) -> dict[str, float]:
+    """Parse texts `NAME=SHARE`, such as kitchen=0.5. Raises RequestError malformed_door, or doubled_door for a name
+    twice."""
+    doors: dict[str, float] = {}
+    for text in texts:
+        name, _, number = text.rpartition("=")
+        try:
+            share = _OPEN_SHARE.validate_python(parse_decimal(number))
+        except ValueError:
+            problem = f"door {text!r} is not NAME=SHARE with a share from 0, shut, to 1, such as kitchen=0.5"
+            raise RequestError("malformed_door", problem, field="door") from None
+        if name in doors:
+            raise RequestError("doubled_door", f"door {name!r} is there twice", field="door", status=409)
+        doors[name] = share
+    return doors
 
 
 def parse_position(text: str, field: str) -> Vector3:

@@ -1,13 +1,12 @@
 """The doors of a scene, and how far they are open."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Literal
 
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import BeforeValidator, Field
 
 from server.acoustics.doors import LeafMotion, Openness
 from server.core.errors import RequestError
-from server.core.numerals import parse_decimal
 from server.scene.geometry import Finite, Point, Strict
 
 MOST_DOORS: Final = 8
@@ -27,9 +26,6 @@ def _to_the_ends(value: object) -> object:
 # guard: a door is open by a share
 OpenShare = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), BeforeValidator(_to_the_ends)]
 """How far a door is open, from 0 to 1."""
-_SHARE: Final[TypeAdapter[float]] = TypeAdapter(OpenShare)
-DOOR_PATTERN: Final = r"^[^\s:,=/][^:,=/]{0,63}=[0-9.eE+-]+$"
-"""The texts that `parse_doors` accepts, as a regular expression of JSON Schema: these, and some that are no numbers."""
 DOOR_NAME: Final = r"^[^\s:,=/][^:,=/]{0,63}$"
 """What a door may be called: what can stand in a query, `kitchen:0.5,hall:1`."""
 DoorName = Annotated[str, Field(pattern=DOOR_NAME)]
@@ -56,23 +52,6 @@ class Door(Strict):
 def openness_of(doors: Sequence[Door]) -> Openness:
     """How far doors are open at the beginning."""
     return tuple(door.openness for door in doors)
-
-
-def parse_doors(texts: Iterable[str]) -> dict[str, float]:
-    """Parse texts `NAME=SHARE`, such as kitchen=0.5. Raises RequestError malformed_door, or doubled_door for a name
-    twice."""
-    doors: dict[str, float] = {}
-    for text in texts:
-        name, _, number = text.rpartition("=")
-        try:
-            share = _SHARE.validate_python(parse_decimal(number))
-        except ValueError:
-            problem = f"door {text!r} is not NAME=SHARE with a share from 0, shut, to 1, such as kitchen=0.5"
-            raise RequestError("malformed_door", problem, field="door") from None
-        if name in doors:
-            raise RequestError("doubled_door", f"door {name!r} is there twice", field="door", status=409)
-        doors[name] = share
-    return doors
 
 
 def read_openness(doors: Sequence[Door], given: Mapping[str, float], before: Openness | None = None) -> Openness:

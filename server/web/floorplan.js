@@ -3,10 +3,12 @@
 // Events: "dropped" (detail: emitter id, after it came to rest), "lifted" (an emitter started to move), "hover" (detail: [x, y] in
 // metres or null).
 
+import { Doors, opennessTowards } from "./doors.js";
 import { View } from "./paper.js";
 import { sourceColour } from "./palette.js";
 
 const SVG = "http://www.w3.org/2000/svg";
+const SLOP = 4; // pixels that a click may move
 
 function element(name, attributes = {}, ...children) {
   const node = document.createElementNS(SVG, name);
@@ -34,6 +36,8 @@ export class FloorPlan extends EventTarget {
   #emitterMarks = new Map();
   #emitterLayer = element("g");
   #drag = null;
+  #doors;
+  #storey = null;
 
   constructor({ svg, paper, world }) {
     super();
@@ -41,7 +45,9 @@ export class FloorPlan extends EventTarget {
     this.#paper = paper;
     this.#world = world;
     this.#listener = this.#buildListener();
-    svg.replaceChildren(this.#emitterLayer, this.#listener);
+    this.#doors = new Doors(world);
+    this.#doors.layer.addEventListener("pointerdown", (event) => this.#grab(event));
+    svg.replaceChildren(this.#doors.layer, this.#emitterLayer, this.#listener);
     svg.addEventListener("pointermove", (event) => this.#move(event));
     svg.addEventListener("pointerup", (event) => this.#drop(event));
     svg.addEventListener("pointercancel", (event) => this.#drop(event));
@@ -78,7 +84,16 @@ export class FloorPlan extends EventTarget {
     this.#svg.setAttribute("viewBox", `0 0 ${width} ${this.#view.height}`);
     this.#svg.style.height = `${this.#view.height}px`;
     this.#paper.resize(this.#view);
+    this.#doors.place(this.#view, this.#storey);
     this.#placeListener();
+    this.#syncEmitters();
+  }
+
+  /** Shows a storey, {floor_m, top_m}: its doors, and what is on others paler. Null shows all. */
+  set storey(storey) {
+    this.#storey = storey;
+    if (!this.#view) return;
+    this.#doors.place(this.#view, storey);
     this.#syncEmitters();
   }
 
@@ -168,6 +183,8 @@ export class FloorPlan extends EventTarget {
     const [x, y] = this.#view.toScreen(position);
     const mark = this.#emitterMarks.get(id);
     mark.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
+    const storey = this.#storey;
+    mark.classList.toggle("elsewhere", storey !== null && (position[2] < storey.floor_m || position[2] >= storey.top_m));
     mark.setAttribute("aria-label", `Source ${id} at ${position[0].toFixed(1)}, ${position[1].toFixed(1)} metres; arrow keys move it`);
   }
 
@@ -188,6 +205,17 @@ export class FloorPlan extends EventTarget {
     const kind = target.dataset.drag;
     const at = this.#pointer(event);
     const id = target.dataset.emitter;
+    if (kind === "door") {
+      const door = this.#world.doors.get(target.dataset.door);
+      // Where the place that was grabbed is while the door is shut.
+      const from = [0, 1].map((axis) => at[axis] - door.openness * door.slide_m[axis]);
+      this.#drag = { kind, door, pointerId: event.pointerId, from, began: at, moved: false };
+      this.#svg.setPointerCapture(event.pointerId);
+      this.#svg.classList.add("dragging");
+      target.focus({ preventScroll: true, focusVisible: false });
+      event.preventDefault();
+      return;
+    }
     const { position } = id ? this.#world.emitters.get(id) : this.#world.listener;
     this.#drag = { kind, id, pointerId: event.pointerId, offset: [position[0] - at[0], position[1] - at[1]], moved: false };
     this.#svg.setPointerCapture(event.pointerId);
@@ -205,6 +233,12 @@ export class FloorPlan extends EventTarget {
       return;
     }
     if (event.pointerId !== drag.pointerId) return;
+    if (drag.kind === "door") {
+      if (!drag.moved && Math.hypot(at[0] - drag.began[0], at[1] - drag.began[1]) * this.#view.scale < SLOP) return;
+      drag.moved = true;
+      this.#world.setDoor(drag.door.name, opennessTowards(drag.door, at, drag.from));
+      return;
+    }
     const to = [at[0] + drag.offset[0], at[1] + drag.offset[1]];
     if (drag.kind === "heading") {
       const { position } = this.#world.listener;
@@ -224,5 +258,6 @@ export class FloorPlan extends EventTarget {
     this.#drag = null;
     this.#svg.classList.remove("dragging");
     if (drag.kind === "emitter" && drag.moved) this.#emit("dropped", drag.id);
+    if (drag.kind === "door" && !drag.moved) this.#world.setDoor(drag.door.name, drag.door.openness < 0.5 ? 1 : 0);
   }
 }

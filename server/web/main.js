@@ -20,9 +20,10 @@ import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
 import { PhoneTurning } from "./phone.js";
 import { Player } from "./player.js";
-import { fetchClips, fetchDecoder, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, streamUrl } from "./scenes.js";
+import { fetchClips, fetchDecoder, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, fetchSection, streamUrl } from "./scenes.js";
 import { linkTo, readSituation } from "./situation.js";
 import { Sources } from "./sources.js";
+import { Storeys } from "./storeys.js";
 import { Turning } from "./turning.js";
 import { Walking } from "./walking.js";
 import { World } from "./world.js";
@@ -38,7 +39,9 @@ const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
 const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
 const LONGEST_RETRY_MS = 30_000;
-const WORLDLY = ["listener", "emitter", "remove"]; // what a stream is told that is not heard yet
+const CUT_M = 1.3; // above a floor: doors and windows show, and most furniture does not
+const DOOR_RESTS_MS = 250; // a door that moves has no map
+const WORLDLY = ["listener", "emitter", "remove", "door"]; // what a stream is told that is not heard yet
 
 const find = (id) => document.getElementById(id);
 const epochNow = () => performance.timeOrigin + performance.now();
@@ -82,6 +85,7 @@ class Page {
     this.scale = null;
     this.scaled = 0; // number of emitters that the scale was made for
     this.hovered = null;
+    this.storey = undefined; // the one that is drawn; null where there are none
   }
 
   async open() {
@@ -167,7 +171,7 @@ class Page {
     this.clips = clips;
     this.world = new World(scene, { mostEmitters });
     this.turning.directionalLevels = scene.directional_levels ?? [];
-    this.frontier.offersHere = (scene.directional_levels ?? []).length > 0;
+    this.frontier.offersHere = (scene.directional_levels ?? []).length > 0 && !scene.is_mesh;
     // Where nothing reverberates, all that is heard is the direct sound. It is sharper through the filters of the head itself.
     if (scene.levels.every(({ field }) => field === NO_FIELD)) this.turning.usual = "server";
     this.panel.turnsHere = this.turning.isHere;
@@ -176,6 +180,7 @@ class Page {
     if (clips.length === 0) this.notices.show("clips", "The server has no clip to play.", { lasting: true });
     this.paper = new Paper(find("paper"), scene);
     this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
+    new Storeys(find("storey-choice"), this.world, (storey) => this.#showStorey(storey));
     this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source"), limit: find("source-limit") });
     new Walking(this.world, { focusedEmitter: () => this.plan.focusedEmitter, dropped: () => this.map() });
     this.#listenToWorld();
@@ -197,7 +202,7 @@ class Page {
     });
     world.addEventListener("emitter", ({ detail }) => {
       this.#say(detail);
-      if (this.grids.get(detail.id)?.key !== placeKey(detail)) this.paper.stale = true;
+      if (this.grids.get(detail.id)?.key !== this.#gridKey(detail)) this.paper.stale = true;
     });
     world.addEventListener("emitters", () => {
       for (const id of known.keys()) if (!world.emitters.has(id)) this.#remove(id);
@@ -207,6 +212,13 @@ class Page {
     });
     known = new Map(world.emitters);
     world.addEventListener("gain", () => this.map());
+    let rest = 0;
+    world.addEventListener("door", ({ detail: { name, openness } }) => {
+      this.#tell("door", { name, openness });
+      this.paper.stale = true;
+      clearTimeout(rest);
+      rest = setTimeout(() => this.map(), DOOR_RESTS_MS);
+    });
     plan.addEventListener("dropped", () => this.map());
     plan.addEventListener("hover", ({ detail }) => {
       this.hovered = detail;
@@ -436,6 +448,7 @@ class Page {
       sampleRate: this.scene.sample_rate,
       level: isHere ? undefined : this.frontier.chosen,
       effects: this.effects.wishes.effects,
+      doors: isHere ? undefined : this.world.openness,
       ...this.#outputOf(output),
     };
     const emitters = [...this.world.emitters.values()].map((emitter) => this.#emitterNow(emitter));
@@ -519,6 +532,7 @@ class Page {
   /** Takes over what a link says, and gives the scene its first source if the link has none. */
   #restore(shared) {
     const { world, scene, clips } = this;
+    for (const [name, openness] of Object.entries(shared?.doors ?? {})) world.setDoor(name, openness);
     if (shared?.listener) world.moveListener(shared.listener.position, shared.listener.yaw);
     const missing = new Set();
     for (const source of shared?.sources ?? []) {
@@ -552,6 +566,7 @@ class Page {
       head: this.heads.chosen,
       turning: this.turning.chosen,
       effects,
+      doors: this.world.openness,
     });
     history.replaceState(null, "", link);
     try {
@@ -766,12 +781,32 @@ class Page {
     }
   }
 
+  /** Draws a storey: what a plane above its floor cuts, its doors, and its loudness. */
+  async #showStorey(storey) {
+    const isFirst = this.storey === undefined;
+    this.storey = this.plan.storey = storey;
+    if (!this.scene.is_mesh) return;
+    if (!isFirst) this.map();
+    try {
+      const lines = await fetchSection(this.scene.id, storey ? storey.floor_m + CUT_M : this.world.listener.position[2]);
+      if (this.storey === storey) this.paper.lines = lines;
+    } catch (error) {
+      this.notices.show("section", `The storey cannot be drawn: ${error.message}`);
+    }
+  }
+
+  /** What the map of an emitter depends on. */
+  #gridKey(emitter) {
+    return [placeKey(emitter), this.storey?.floor_m, JSON.stringify(this.world.openness)].join();
+  }
+
   async #grid({ id, position }, signal) {
-    const key = placeKey({ position });
+    const doors = this.world.openness;
+    const key = this.#gridKey({ position });
     const known = this.grids.get(id);
     if (known?.key === key) return known.grid;
     const heightM = this.world.listener.position[2];
-    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, signal }));
+    const grid = parseGrid(await fetchLoudness(this.scene.id, { position, heightM, doors, signal }));
     this.grids.set(id, { key, grid });
     return grid;
   }

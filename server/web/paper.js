@@ -1,5 +1,5 @@
 // The static part of the floor plan, drawn on a canvas: walls (or the bounds if the walls are unknown), the loudness map on the floor,
-// and scales along the edges.
+// the lines of a cut through a mesh, and scales along the edges.
 
 import { colour, loudnessRamp } from "./palette.js";
 
@@ -50,6 +50,7 @@ export class Paper {
   #before = null;
   #fadeStart = 0;
   #stale = false;
+  #lines = []; // [x, y, x, y] of a cut
 
   constructor(canvas, { corners, walls_known: walled }) {
     this.#canvas = canvas;
@@ -76,6 +77,12 @@ export class Paper {
     this.#repaintMap();
     this.#fadeStart = performance.now();
     this.#fade();
+  }
+
+  /** Lines [x, y, x, y] to draw over the map: a cut through the scene. */
+  set lines(lines) {
+    this.#lines = lines;
+    this.draw();
   }
 
   /** Whether the map is out of date; it is then drawn paler. */
@@ -131,7 +138,8 @@ export class Paper {
     if (this.#before) this.#drawMap(context, this.#before, 1);
     if (this.#map) this.#drawMap(context, this.#map, (this.#before ? progress : 1) * (this.#stale ? 0.45 : 1));
     context.restore();
-    if (!this.#walled) this.#drawBounds(context);
+    if (this.#lines.length > 0) this.#drawLines(context);
+    else if (!this.#walled) this.#drawBounds(context);
     this.#drawMeasures(context);
   }
 
@@ -151,6 +159,19 @@ export class Paper {
     context.strokeStyle = colour("--wall");
     context.lineWidth = 2 * this.#view.wall;
     context.stroke();
+  }
+
+  #drawLines(context) {
+    context.beginPath();
+    for (const [x0, y0, x1, y1] of this.#lines) {
+      context.moveTo(...this.#view.toScreen([x0, y0]));
+      context.lineTo(...this.#view.toScreen([x1, y1]));
+    }
+    context.strokeStyle = colour("--wall");
+    context.lineWidth = 1.75;
+    context.lineCap = "round";
+    context.stroke();
+    context.lineCap = "butt";
   }
 
   #drawBounds(context) {

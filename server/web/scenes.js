@@ -16,8 +16,16 @@ export const fetchHeads = () => getJson(endpoint("hrtfs"));
 /** The filters by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. */
 export const fetchDecoder = (head, wanted) => getJson(decoderUrl(BASE, head, wanted));
 
-export function fetchLoudness(scene, { position, heightM, signal }) {
+/** The lines [x, y, x, y] in which a plane cuts the scene at a height. */
+export async function fetchSection(scene, heightM) {
+  const url = endpoint(`scenes/${encodeURIComponent(scene)}/section`);
+  url.searchParams.set("height_m", heightM.toFixed(3));
+  return (await getJson(url)).lines;
+}
+
+export function fetchLoudness(scene, { position, heightM, doors = {}, signal }) {
   const url = endpoint(`scenes/${encodeURIComponent(scene)}/loudness`);
+  for (const [name, openness] of Object.entries(doors)) url.searchParams.append("door", `${name}=${openness}`);
   const query = { emitter: position.map((value) => value.toFixed(3)).join(","), height_m: heightM, format: "json" };
   for (const [key, value] of Object.entries(query)) url.searchParams.set(key, value);
   return getJson(url, { signal });

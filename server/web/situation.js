@@ -1,5 +1,6 @@
 // A situation as a link: the scene in the query, and after the # who stands where, what plays and how it is heard.
 //
+//   ?scene=house#doors=living:0.5,bath:1&listener=…
 //   ?scene=apartment#listener=2.2,2,1.6,45&source=guitar,6,3,1.5,-3&source=claps,1,1,1.5&level=…&output=mono&head=kemar&turning=server&effects=hrtf:off
 //
 // Positions are metres, the listener's last number is its yaw in degrees, a source's is its gain in decibels.
@@ -11,7 +12,7 @@ const rounded = (value) => +value.toFixed(DIGITS);
 const degrees = (radians) => (radians * 180) / Math.PI;
 
 /** The link to a situation, on the page at `href`. What the situation does not have is left to the page. */
-export function linkTo(href, { scene, listener, sources, level, output, head, turning, effects }) {
+export function linkTo(href, { scene, listener, sources, level, output, head, turning, effects, doors }) {
   const said = new URLSearchParams();
   said.append("listener", [...listener.position.map(rounded), rounded(degrees(listener.yaw))].join());
   for (const { clip, position, gainDb } of sources) {
@@ -22,6 +23,8 @@ export function linkTo(href, { scene, listener, sources, level, output, head, tu
   for (const [name, value] of Object.entries({ level, output, head, turning })) if (value !== undefined) said.append(name, value);
   const switched = Object.entries(effects ?? {}).map(([name, isOn]) => `${name}:${isOn ? "on" : "off"}`);
   if (switched.length > 0) said.append("effects", switched.join());
+  const moved = Object.entries(doors ?? {}).map(([name, openness]) => `${encodeURIComponent(name)}:${rounded(openness)}`);
+  if (moved.length > 0) said.append("doors", moved.join());
   const link = new URL(href);
   link.search = new URLSearchParams({ scene });
   // Commas and colons may stand in a fragment, and are easier to read than what they are escaped to.
@@ -61,6 +64,12 @@ function effectsOf(text) {
   return Object.fromEntries(pairs.filter(([name, state]) => name && ["on", "off"].includes(state)).map(([name, state]) => [name, state === "on"]));
 }
 
+function doorsOf(text) {
+  const pairs = (text ?? "").split(",").map((each) => each.split(":"));
+  const read = pairs.filter(([name, share]) => name && (share ?? "").trim() !== "" && Number.isFinite(Number(share)));
+  return Object.fromEntries(read.map(([name, share]) => [decoded(name), Number(share)]));
+}
+
 /** What a link says after its #, or null if it says nothing. Parts that cannot be read are left out. */
 export function readSituation(hash) {
   const said = new URLSearchParams(hash.replace(/^#/, ""));
@@ -74,5 +83,6 @@ export function readSituation(hash) {
     head,
     turning,
     effects: effectsOf(said.get("effects")),
+    doors: doorsOf(said.get("doors")),
   };
 }

@@ -1,6 +1,6 @@
 // The contents of the scene: one listener and a few emitters, always in places where they may stand.
-// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise), "emitters" (one was added or removed) and "limit" (the largest
-// number of emitters has changed).
+// Events: "listener", "emitter" (detail: the emitter), "gain" (likewise), "emitters" (one was added or removed), "limit" (the largest
+// number of emitters has changed) and "door" (detail: the door).
 
 import { Floor, distance, wrapAngle } from "./geometry.js";
 
@@ -25,6 +25,21 @@ export class World extends EventTarget {
     this.floor = new Floor({ corners: scene.corners, minimum: [west, south], maximum: [east, north], clearance });
     this.listener = { position: [...scene.listener.position], yaw: scene.listener.yaw ?? 0 };
     this.emitters = new Map();
+    this.doors = new Map((scene.doors ?? []).map((door) => [door.name, { ...door }]));
+  }
+
+  /** Opens a door so far, from 0, shut, to 1. */
+  setDoor(name, openness) {
+    const door = this.doors.get(name);
+    const share = Math.min(1, Math.max(0, Math.round(1000 * openness) / 1000));
+    if (!door || door.openness === share) return;
+    door.openness = share;
+    this.#emit("door", door);
+  }
+
+  /** How far each door is open, by name; undefined if there are none. */
+  get openness() {
+    return this.doors.size === 0 ? undefined : Object.fromEntries([...this.doors.values()].map(({ name, openness }) => [name, openness]));
   }
 
   #emit(type, detail) {

@@ -106,6 +106,7 @@ def test_the_server_reads_every_text_message_of_a_session():
     session.move_emitter(talker, (2.0, 2.0, 1.0), (0.0, 0.0, 0.0, 1.0), 0.0)
     session.set_gain(talker, -6.0, 0.5)
     session.set_level("auto")
+    session.set_door("kitchen", 0.25)
     session.set_effects({"hrtf": None, "occlusion": False}, "mono")
     session.ping(0.0)
     session.stop_emitter(talker, 48_000, 0.5)
@@ -118,6 +119,7 @@ def test_the_server_reads_every_text_message_of_a_session():
         "move_emitter",
         "set_gain",
         "set_level",
+        "set_door",
         "set_effects",
         "ping",
         "stop_emitter",
@@ -127,6 +129,7 @@ def test_the_server_reads_every_text_message_of_a_session():
     assert isinstance(hello, Hello)
     assert (hello.scene, hello.block_size, hello.output, hello.effects) == ("flat", 512, "mono", {"occlusion": False})
     assert hello.listener.position == (1.0, 2.0, 1.0)
+    assert hello.doors == {"kitchen": 0.25}
 
 
 def test_a_new_connection_asks_for_what_the_last_one_had():

@@ -10,9 +10,9 @@ from server.acoustics.doors import LeafMotion
 from server.api.catalogue import describe_scene
 from server.core.errors import BundleError, RequestError
 from server.field.fields_by_level import FieldsByLevel
-from server.responses.impulse_response import ImpulseResponse, IrQuery, entity_tag
+from server.responses.impulse_response import ImpulseResponse, IrQuery, entity_tag, parse_doors
 from server.scene.bundle import write_bundle
-from server.scene.door import parse_doors, read_openness
+from server.scene.door import read_openness
 from server.scene.manifest import Manifest
 from tests.two_rooms import EAST, SLIDE, WEST, box, document, door, leaf, rooms, write_two_rooms
 

@@ -419,6 +419,10 @@ class Session:
         self._hello["level"] = level
         self._put({"type": "set_level", "level": level})
 
+    def set_door(self, door: str, openness: float) -> None:
+        self._hello["doors"] = {**self._hello.get("doors", {}), door: openness}
+        self._put({"type": "set_door", "door": door, "openness": openness}, ("door", door))
+
     def set_effects(self, effects: Mapping[str, bool | None], output: str | None) -> None:
         wished = {**self._hello.get("effects", {}), **effects}
         self._hello["effects"] = {name: is_on for name, is_on in wished.items() if is_on is not None}

@@ -435,6 +435,10 @@ class Stream:
         """Choose a quality level, or `auto`. A `level_changed` says from when on it is heard."""
         await self.change(lambda session: session.set_level(level))
 
+    async def set_door(self, door: str, openness: float) -> None:
+        """Open a door of the scene so far, from 0, shut, to 1. The scene of the welcome has those there are."""
+        await self.change(lambda session: session.set_door(door, openness))
+
     async def set_effects(self, effects: Mapping[str, bool | None], *, output: str | None = None) -> None:
         """Switch effects on or off; None leaves one to the server's plan. `output` is `headphones` or `mono`."""
         await self.change(lambda session: session.set_effects(effects, output))

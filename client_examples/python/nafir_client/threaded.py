@@ -343,6 +343,10 @@ class ThreadedStream:
         """Choose a quality level, or `auto`."""
         self.run_later(lambda: self._stream.set_level(level))
 
+    def set_door(self, door: str, openness: float) -> None:
+        """Open a door of the scene so far, from 0, shut, to 1."""
+        self.run_later(lambda: self._stream.set_door(door, openness))
+
     def set_effects(self, effects: Mapping[str, bool | None], *, output: str | None = None) -> None:
         """Switch effects on or off; None leaves one to the server's plan."""
         self.run_later(lambda: self._stream.set_effects(effects, output=output))

@@ -148,6 +148,8 @@ export interface Nafir extends EventTarget {
   removeListener(id: string): void;
   /** Chooses a quality level of the scene, or "auto". */
   set level(name: string);
+  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.scene.doors` has those there are. */
+  setDoor(name: string, openness: number): void;
   /** Switches effects on or off by name; null leaves one to the server's plan. */
   setEffects(effects: Record<string, boolean | null>): void;
   /** From setting a pose to its sound, medians of the last seconds. */

@@ -388,6 +388,11 @@ class Nafir extends EventTarget {
     this.#stream.tell("level", { name });
   }
 
+  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.scene.doors` has those there are. */
+  setDoor(name, openness) {
+    this.#stream.tell("door", { name, openness });
+  }
+
   /** Switches effects on or off by name; null leaves one to the server's plan. */
   setEffects(effects) {
     this.#stream.tell("effects", { effects });

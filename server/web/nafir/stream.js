@@ -198,6 +198,12 @@ export class Stream {
     if (this.#isOpen) this.#order(message.setLevel(level), "level");
   }
 
+  /** Opens a door of the scene so far, from 0, shut, to 1. */
+  setDoor({ name, openness }) {
+    this.#hello = { ...this.#hello, doors: { ...this.#hello.doors, [name]: openness } };
+    if (this.#isOpen) this.#order(message.setDoor({ name, openness }), `door ${name}`);
+  }
+
   /** Each of `effects` is on, off, or null to follow the plan; `output` is null to keep the present one. */
   setEffects({ effects, output }) {
     const wished = { ...this.#hello.effects, ...effects };

@@ -74,6 +74,7 @@ const commands = {
     taps.get(id)?.close();
     taps.delete(id);
   },
+  door: (detail) => stream?.setDoor(detail),
   level: ({ name }) => stream?.setLevel(name),
   renew: (changes) => stream?.renew(changes),
   effects: (wishes) => stream?.setEffects(wishes),

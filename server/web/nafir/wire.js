@@ -123,14 +123,15 @@ export function parsePackets(buffer) {
 }
 
 export const message = {
-  hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters, listeners }) =>
+  hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters, listeners, doors }) =>
     JSON.stringify({
       type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
-      buffer_blocks: bufferBlocks, listener, emitters, listeners,
+      buffer_blocks: bufferBlocks, listener, emitters, listeners, doors,
     }),
   resume: ({ token, sequence, sampleClock }) =>
     JSON.stringify({ type: "resume", protocol: PROTOCOL, token, sequence, sample_clock: sampleClock }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
+  setDoor: ({ name, openness }) => JSON.stringify({ type: "set_door", door: name, openness }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
   addEmitter: ({ id, clip, live, loop, position, orientation, directivity, gainDb }) =>
     JSON.stringify({ type: "add_emitter", id, clip, live, loop, position, orientation, directivity, gain_db: gainDb }),
