@@ -18,8 +18,10 @@ from training.bundling.graphs import to_int8, to_onnx
 from training.models.cells import Cells
 from training.models.encoders import FieldShape
 from training.models.factorised import ExportedField, FactorisedField
+from training.models.site import Extent
 
 PLAN = FloorPlan(((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)), 2.5)
+EXTENT = Extent.of_plan(PLAN)
 DB = 20 / np.log(10)
 
 # The field's levels vary by 0.73 dB from pose to pose: a bound above that would let a field pass that says nothing.
@@ -32,7 +34,7 @@ def graphs():
     torch.manual_seed(3)
     cells = Cells(Codec(8_000, 256, 64, 2_000, 1e-5), fine_frames=8, known_frames=1)
     shape = FieldShape(rank=8, width=32, depth=2, grid_spacing_m=1.0, grid_features=4)
-    field = FactorisedField(PLAN, cells, shape)
+    field = FactorisedField(EXTENT, cells, shape)
     with torch.no_grad():
         field.mean[field.heads.slices["fine"]] = -3.0
         field.mean[field.heads.slices["late"]] = -6.0

@@ -23,8 +23,10 @@ from server.scene.manifest import Phase
 from tests.damaged_field import write_ill_in_the_east
 from training.models.encoders import FeatureGrid
 from training.models.local_geometry import GaussianGrid, OrientationEmbedding
+from training.models.site import Extent
 
 PLAN = FloorPlan(((0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (0.0, 5.0)), 2.8)
+EXTENT = Extent.of_plan(PLAN)
 FAR = [(9.0, 6.0), (80.0, -40.0), (5e3, 5e3), (1e6, -1e6), (1e15, 0.0)]
 
 
@@ -50,7 +52,7 @@ def difference_db(found, expected):
 
 def grid():
     torch.manual_seed(0)
-    return FeatureGrid(PLAN, 0.5, 8)
+    return FeatureGrid(EXTENT, 0.5, 8)
 
 
 # Kernels over a grid.

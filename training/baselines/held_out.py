@@ -20,6 +20,7 @@ from server.scene.bundle import Bundle
 from training.baselines.baselines import PairResponses, TrainingPairs
 from training.data.dataset import TAKES, Dataset, Half
 from training.data.dataset_check import DatasetError
+from training.data.levels.level_scene import LevelScene
 from training.data.responses import ImportedDataset
 from training.simulation.references import References
 from training.simulation.responses import SimulatedResponses, open_responses
@@ -154,8 +155,13 @@ def open_held_out(folder: Path) -> Iterator[HeldOut]:
 def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
     """Raises DatasetError if dataset and bundle are of different scenes."""
     codec = bundle.manifest.codec.codec
-    of_bundle = bundle.manifest.geometry, codec.sample_rate, codec.samples
-    if of_bundle != (dataset.scene.geometry, dataset.sample_rate, dataset.samples):
+    is_same = (codec.sample_rate, codec.samples) == (dataset.sample_rate, dataset.samples)
+    if isinstance(dataset.place, LevelScene):
+        place = dataset.place.place
+        is_same &= bundle.mesh is not None and bundle.mesh.to_bytes() == place.mesh.to_bytes()
+    else:
+        is_same &= bundle.manifest.geometry == dataset.place.geometry
+    if not is_same:
         raise DatasetError(f"{dataset.folder}: is not of the scene of {bundle.folder}")
 
 
@@ -166,7 +172,7 @@ def _of_simulation(dataset: Dataset) -> HeldOut:
     training = ~dataset.held_out.ravel() & (emitter != listener)
     return HeldOut(
         folder=dataset.folder,
-        name=f"{dataset.scene.id} (simulated)",
+        name=f"{dataset.place.id} (simulated)",
         sample_rate=dataset.sample_rate,
         samples=dataset.samples,
         channels=2,
@@ -176,7 +182,7 @@ def _of_simulation(dataset: Dataset) -> HeldOut:
         delays_s=dataset.onset_s.ravel(),
         yaws=dataset.yaws,
         yaw_indices=np.arange(len(dataset.yaws)),
-        visible=dataset.plan.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
+        visible=dataset.surroundings.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
         simulated=dataset,
     )
 

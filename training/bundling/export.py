@@ -32,6 +32,7 @@ from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_on
 from training.bundling.manifests import Fields, measured_manifest, simulated_manifest
 from training.bundling.noise import choose_noise
 from training.bundling.shaped_graph import ShapedNearestGraph
+from training.data.levels.level_scene import MESH_FILE, LevelScene
 from training.data.responses import FILE, ImportedDataset, ResponseSet
 from training.evaluation.fields import INTEGRATED
 from training.learning.basis import BasisLearner
@@ -156,6 +157,8 @@ def export(
     files, described = _contents(exported, precisions[0], seed)
     if isinstance(responses, SimulatedResponses):
         manifest = simulated_manifest(responses, described, whole=whole)
+        if isinstance(responses.dataset.place, LevelScene):
+            files[MESH_FILE] = responses.dataset.place.place.mesh.to_bytes()
     else:
         assert isinstance(responses, ImportedDataset)
         manifest = measured_manifest(responses, described)

@@ -13,14 +13,17 @@ from server.scene.geometry import Point
 from server.scene.manifest import (
     DIRECTIONS_FORMAT,
     EARS_FORMAT,
+    MESH_FORMAT,
     Bounds,
     CodecParameters,
     FieldFile,
     Manifest,
     QualityLevel,
+    SceneMesh,
     Start,
 )
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
+from training.data.levels.level_scene import MESH_FILE, LevelScene
 from training.data.responses import ImportedDataset, ResponsesError
 from training.simulation.responses import SimulatedResponses
 
@@ -41,7 +44,9 @@ class Fields:
 
 def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: bool = False) -> Manifest:
     """The manifest of a simulated scene. `whole`: the fields include direct sound and first reflections."""
-    scene = responses.dataset.scene
+    scene = responses.dataset.place
+    if isinstance(scene, LevelScene):
+        return _level_manifest(scene, responses, fields, whole=whole)
     has_directions = any(field.predicts == "directions" for field in fields.fields.values())
     low, high = np.min(scene.geometry.corners, axis=0), np.max(scene.geometry.corners, axis=0)
     return Manifest(
@@ -65,6 +70,29 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: 
         fields=fields.fields,
         levels=fields.levels,
         files=fields.files,
+    )
+
+
+def _level_manifest(level: LevelScene, responses: SimulatedResponses, fields: Fields, *, whole: bool) -> Manifest:
+    """Doors stand as they were simulated, and are part of the mesh."""
+    (west, south, low), (east, north, high) = level.place.mesh.bounds_m.tolist()
+    return Manifest(
+        id=level.id,
+        name=level.file.name,
+        description=level.file.description,
+        mesh=SceneMesh(file=MESH_FILE, materials=dict(level.place.materials), open_sky=level.file.geometry.open_sky),
+        bounds=Bounds(minimum=(west, south, low), maximum=(east, north, high)),
+        speed_of_sound=SPEED_OF_SOUND,
+        air=level.air,
+        image_order=0 if whole else GEOMETRIC_ORDER,
+        direct_sound="field" if whole else "geometry",
+        transmission=responses.dataset.effects.transmission,
+        start=level.file.start,
+        format_version=MESH_FORMAT,
+        codec=fields.codec,
+        fields=fields.fields,
+        levels=fields.levels,
+        files={**fields.files, MESH_FILE: "0" * 64},
     )
 
 

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.surroundings import PlanSurroundings, Surroundings
 from training.data.dataset_check import DatasetError, require_possible_energies
 from training.data.levels.level_scene import SCENE_FILE, LevelScene, is_same_scene, read_scene
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
@@ -175,6 +176,11 @@ class Dataset:
     @cached_property
     def plan(self) -> FloorPlan:
         return self.scene.geometry.floor_plan
+
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        """The geometry of the place."""
+        return self.place.surroundings if isinstance(self.place, LevelScene) else PlanSurroundings(self.plan)
 
     @cached_property
     def onset_s(self) -> npt.NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -109,6 +109,11 @@ class SceneFile(Strict):
     simulation: Simulation
     effects: dict[str, bool] = Field(default_factory=dict)
     """Effects that are on or off, whatever the plans of rendering and simulation say."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """All that the scene says, as JSON has it."""
+        return self.model_dump(mode="json")
 
     @classmethod
     def read(cls, path: Path) -> "SceneFile":

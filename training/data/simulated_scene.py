@@ -1,7 +1,7 @@
 """What a simulation asks of a scene, be it a floor plan (`training.data.scene_file`) or a level
 (`training.data.levels.level_scene`)."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,10 @@ class SimulatedScene(Protocol):
 
     @property
     def simulation(self) -> Simulation: ...
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells the scene from any other, as JSON has it."""
 
     def probe_positions(self, seed: int) -> _Floats:
         """(probe, 3) positions in the air; the same for the same seed."""

@@ -158,7 +158,7 @@ class SampledPairs:
             entry = Entry(
                 *ends,
                 yaws=heads,
-                visible=bool(dataset.plan.is_visible(*ends)),
+                visible=bool(dataset.surroundings.is_visible(*ends)),
                 reference=reference,
                 reflected=first.reflected(emitter, listener),
                 repeat=second.complete(emitter, listener) if held_out else None,

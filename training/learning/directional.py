@@ -47,7 +47,7 @@ class DirectionalLearner(BasisLearner):
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), known_frames=0)
         self.site = Site.of(responses)
         try:
-            field = DirectionalField(self.site.plan, self.cells, shape, recipe.order, reach=Reach.of(responses))
+            field = DirectionalField(self.site.extent, self.cells, shape, recipe.order, reach=Reach.of(responses))
         except ValueError as exc:
             raise RecipeError(str(exc)) from exc
         super().__init__(field, _SPREADS, _HEAD_WEIGHTS, InterpolatedBands(self.cells))

@@ -37,12 +37,12 @@ def distillation_targets(teacher: NafLearner, cells: Cells, count: int, seed: in
     """Targets at `count` poses near measured ones: both ends are moved by up to half a metre along x and y, where the
     new position is inside the room."""
     rng = np.random.default_rng([seed, 9])
-    responses, plan = teacher.responses, teacher.site.plan
+    responses, surroundings = teacher.responses, teacher.site.surroundings
     chosen = rng.choice(np.flatnonzero(~responses.held_out), count)
     ends = []
     for measured in (responses.listener[chosen], responses.emitter[chosen]):
         beside = measured + rng.uniform(-_LARGEST_MOVE_M, _LARGEST_MOVE_M, measured.shape) * (1, 1, 0)
-        inside = np.array([bool(plan.contains(point)) for point in beside])
+        inside = surroundings.contains(beside)
         ends.append(np.where(inside[:, None], beside, measured).astype(np.float32))
     listener, emitter = ends
     yaw = responses.yaw[chosen].astype(np.float32)

@@ -54,7 +54,7 @@ class FactorisedLearner(BasisLearner):
         codec = codec_of(responses)
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), min(known, recipe.fine_frames))
         self.site = Site.of(responses)
-        field = FactorisedField(self.site.plan, self.cells, shape, responses.channels, reach=Reach.of(responses))
+        field = FactorisedField(self.site.extent, self.cells, shape, responses.channels, reach=Reach.of(responses))
         decode = InterpolatedLevels(self.cells, responses.channels) if recipe.level_correction else None
         super().__init__(field, _SPREADS, _HEAD_WEIGHTS, decode)
         deficit = 0.0 if self._expected else RAYLEIGH_DEFICIT

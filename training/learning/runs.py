@@ -357,7 +357,7 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
 def _identity(responses: ResponseSet) -> dict[str, Any]:
     """Facts that identify the data, wherever they are stored."""
     if isinstance(responses, SimulatedResponses):
-        return {"seed": responses.dataset.seed, "scene": responses.dataset.scene.model_dump(mode="json")}
+        return {"seed": responses.dataset.seed, "scene": responses.dataset.place.identity}
     ends = np.concatenate([responses.listener, responses.emitter, responses.yaw[:, None]], axis=1)
     return {
         "sample_rate": responses.sample_rate,

@@ -13,13 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.geometry import FloorPlan
 from server.acoustics.spherical_harmonics import harmonic_count
 from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from training.models.basis_field import BasisField, ExportedBasis, tile
 from training.models.cells import Cells
 from training.models.encoders import FieldShape, PathEncoder
-from training.models.site import Reach
+from training.models.site import Extent, Reach
 
 
 class DirectionHeads(nn.Module):
@@ -49,10 +48,10 @@ class DirectionalField(BasisField):
     """The field of directions."""
 
     def __init__(
-        self, plan: FloorPlan, cells: Cells, shape: FieldShape, order: int, *, reach: Reach | None = None
+        self, extent: Extent, cells: Cells, shape: FieldShape, order: int, *, reach: Reach | None = None
     ) -> None:
-        """Without `reach`, the field is valid throughout the plan."""
-        encoder = PathEncoder(plan, shape, reach or Reach.throughout(plan))
+        """Without `reach`, the field is valid throughout the place."""
+        encoder = PathEncoder(extent, shape, reach or Reach.throughout(extent))
         super().__init__(DirectionHeads(cells, order), encoder, shape)
 
 

@@ -11,15 +11,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import DESCRIPTION
-from training.models.site import Reach
+from training.models.site import Extent, Reach
 
 _AZIMUTH_HARMONICS = 5
 _YAW_HARMONICS = 3
 _PATH_DIRECTIONS = 2 + 2
 """Number of features that follow the sight feature: the path's directions at both ends."""
 _POSITION_OCTAVES = 3
+_EARS_M = 1.5
+"""The height above a floor of its grid."""
 _MOST_LOG_PRECISION = 14.0
 """Corresponds to a bandwidth of a millimetre."""
 
@@ -37,7 +38,8 @@ class FieldShape:
 
 class FeatureGrid(nn.Module):
     """Learned features on a grid in plan, interpolated by a Gaussian Nadaraya-Watson kernel with a learned bandwidth
-    for each node.
+    for each node. Where storeys are told apart, there is a grid at ear height above each floor, and distances are in
+    three dimensions.
 
     Listener and emitter use the same grid, because the surroundings of a place are the same for both. The kernel is a
     softmax, so it cannot underflow to 0/0 far from every node.
@@ -45,18 +47,21 @@ class FeatureGrid(nn.Module):
 
     _nodes: Tensor
 
-    def __init__(self, plan: FloorPlan, spacing_m: float, features: int) -> None:
+    def __init__(self, extent: Extent, spacing_m: float, features: int) -> None:
         super().__init__()
-        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
-        steps = [np.linspace(a, b, max(2, round((b - a) / spacing_m) + 1)) for a, b in zip(low, high, strict=True)]
-        nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        ends = zip(extent.low[:2], extent.high[:2], strict=True)
+        steps = [np.linspace(a, b, max(2, round((b - a) / spacing_m) + 1)) for a, b in ends]
+        if extent.floors_m:
+            steps.append(np.array(extent.floors_m) + _EARS_M)
+        self._axes = len(steps)
+        nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, self._axes)
         self.register_buffer("_nodes", torch.tensor(nodes, dtype=torch.float32), persistent=False)
         self._log_precision = nn.Parameter(torch.full((len(nodes),), float(-2 * np.log(spacing_m / 2) - np.log(2))))
         self._features = nn.Parameter(torch.randn(len(nodes), features) * 0.1)
 
     def forward(self, position: Tensor) -> Tensor:
         """(..., 2 or 3) metres to (..., features)."""
-        offset = position[..., :2, None] - self._nodes.T
+        offset = position[..., : self._axes, None] - self._nodes.T
         squared = torch.sum(offset * offset, dim=-2)
         # On a node, an infinite precision would give 0 times infinity.
         # guard: a bandwidth of zero is none
@@ -81,16 +86,15 @@ class _Encoder(nn.Module):
     _turns: Tensor
     _after_sight = _PATH_DIRECTIONS
 
-    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
+    def __init__(self, extent: Extent, shape: FieldShape, reach: Reach) -> None:
         super().__init__()
         self._nearest_m = reach.nearest_m
         self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
         self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
-        self.sees_all = not len(plan.bend_corners)
+        self.sees_all = not extent.hides
         """Whether all places see each other."""
-        self._grid = FeatureGrid(plan, shape.grid_spacing_m, shape.grid_features)
-        low, high = np.min(plan.corners, axis=0), np.max(plan.corners, axis=0)
-        box = np.array([(*low, 0.0), (*high, plan.height_m)], dtype=np.float32)
+        self._grid = FeatureGrid(extent, shape.grid_spacing_m, shape.grid_features)
+        box = np.array([extent.low, extent.high], dtype=np.float32)
         self.register_buffer("_centre", torch.tensor(box.mean(axis=0)), persistent=False)
         self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
         quarter = np.pi / 2
@@ -143,8 +147,8 @@ class _Encoder(nn.Module):
 class PathEncoder(_Encoder):
     """Encodes listener, emitter and path, without a head, as `size` features in world axes."""
 
-    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
-        super().__init__(plan, shape, reach)
+    def __init__(self, extent: Extent, shape: FieldShape, reach: Reach) -> None:
+        super().__init__(extent, shape, reach)
         self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1, DESCRIPTION)).shape[-1]
 
     def forward(self, listener: Tensor, emitter: Tensor, path: Tensor) -> Tensor:
@@ -159,8 +163,8 @@ class PoseEncoder(_Encoder):
     _turns_back: Tensor
     _after_sight = _PATH_DIRECTIONS + 2 * _YAW_HARMONICS
 
-    def __init__(self, plan: FloorPlan, shape: FieldShape, reach: Reach) -> None:
-        super().__init__(plan, shape, reach)
+    def __init__(self, extent: Extent, shape: FieldShape, reach: Reach) -> None:
+        super().__init__(extent, shape, reach)
         turns_back = np.zeros((2 * _YAW_HARMONICS, 4))
         turns_back[[0, _YAW_HARMONICS]] = [[1, 0, 0, 1], [0, -1, 1, 0]]
         self._keep("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2))

@@ -16,11 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from server.acoustics.geometry import FloorPlan
 from training.models.basis_field import BasisField, ExportedBasis, Layout, tile
 from training.models.cells import Cells
 from training.models.encoders import FieldShape, PoseEncoder
-from training.models.site import Reach
+from training.models.site import Extent, Reach
 
 _NO_LENGTH = 1e-12
 """The least divisor of a phasor's imaginary part."""
@@ -53,10 +52,10 @@ class FactorisedField(BasisField):
     """The field of ears."""
 
     def __init__(
-        self, plan: FloorPlan, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
+        self, extent: Extent, cells: Cells, shape: FieldShape, channels: int = 2, *, reach: Reach | None = None
     ) -> None:
-        """Without `reach`, the field is valid throughout the plan."""
-        encoder = PoseEncoder(plan, shape, reach or Reach.throughout(plan))
+        """Without `reach`, the field is valid throughout the place."""
+        encoder = PoseEncoder(extent, shape, reach or Reach.throughout(extent))
         super().__init__(Heads(cells, channels), encoder, shape)
 
 

@@ -7,8 +7,11 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import PlanPathFinder, SoundPathFinder
+from server.acoustics.mesh_plan import floors_of
+from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.surroundings import PlanSurroundings, Surroundings
 from training.data.dataset import SPEED_OF_SOUND
+from training.data.levels.level_scene import LevelScene
 from training.data.responses import ResponseSet
 from training.simulation.responses import SimulatedResponses
 
@@ -33,19 +36,41 @@ class Reach:
         return cls(positions.min(axis=0), positions.max(axis=0), max(float(distances_m.min()), _NEAREST_M))
 
     @classmethod
-    def throughout(cls, plan: FloorPlan) -> "Reach":
+    def throughout(cls, extent: "Extent") -> "Reach":
+        return cls(extent.low, extent.high, _NEAREST_M)
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The box of a place from `low` to `high` (3,), in metres. `floors_m` are the heights of its floors, where a field
+    is to tell storeys apart; empty for a floor plan. `hides` says whether places are hidden from each other."""
+
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+    hides: bool
+    floors_m: tuple[float, ...] = ()
+
+    @classmethod
+    def of_plan(cls, plan: FloorPlan) -> "Extent":
         corners = np.asarray(plan.corners, dtype=np.float64)
-        return cls(np.array([*corners.min(axis=0), 0.0]), np.array([*corners.max(axis=0), plan.height_m]), _NEAREST_M)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return cls(np.array([*low, 0.0]), np.array([*high, plan.height_m]), len(plan.bend_corners) > 0)
+
+    @classmethod
+    def of_level(cls, level: LevelScene) -> "Extent":
+        low, high = level.surroundings.bounds_m
+        return cls(low, high, level.surroundings.has_obstacles, tuple(floors_of(level.place.mesh)))
 
 
 @dataclass(frozen=True)
 class Site:
-    """`low` and `high` (3,) enclose all positions, in metres. `plan` is the floor plan; if it is unknown, it is a box
-    around the positions, in which all points see each other. `yaws` (yaw,) are the measured head orientations,
-    ascending in [0, 2 pi). `listener_axes` and `emitter_axes` are the coordinates that vary at that end; x and y are
-    always among them."""
+    """`low` and `high` (3,) enclose all positions, in metres. `extent` and `surroundings` are those of the place; if it
+    is unknown, it is a box around the positions, in which all points see each other. `yaws` (yaw,) are the measured
+    head orientations, ascending in [0, 2 pi). `listener_axes` and `emitter_axes` are the coordinates that vary at that
+    end; x and y are always among them."""
 
-    plan: FloorPlan
+    extent: Extent
+    surroundings: Surroundings
     low: npt.NDArray[np.float64]
     high: npt.NDArray[np.float64]
     yaws: npt.NDArray[np.float64]
@@ -54,7 +79,7 @@ class Site:
 
     @cached_property
     def _finder(self) -> SoundPathFinder:
-        return PlanPathFinder(self.plan, SPEED_OF_SOUND)
+        return self.surroundings.sound_paths(SPEED_OF_SOUND)
 
     def paths(self, listeners: npt.NDArray[np.floating], emitters: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """Describe the shortest paths of pairs, (B, 3) and (B, 3), as a field is told of them."""
@@ -65,18 +90,25 @@ class Site:
         ends = responses.listener, responses.emitter
         positions = np.concatenate(ends)
         low, high = positions.min(axis=0), positions.max(axis=0)
-        if isinstance(responses, SimulatedResponses):
-            plan = responses.dataset.plan
-            corners = np.asarray(plan.corners)
-            low[:2], high[:2] = corners.min(axis=0), corners.max(axis=0)
+        if isinstance(responses, SimulatedResponses) and isinstance(responses.dataset.place, LevelScene):
+            level = responses.dataset.place
+            extent = Extent.of_level(level)
+            surroundings: Surroundings = level.surroundings
+            low[:2], high[:2] = extent.low[:2], extent.high[:2]
         else:
-            # guard: places on a line have room around them
-            (x, y), (right, top) = low[:2] - _MARGIN_M, high[:2] + _MARGIN_M
-            # guard: places on the floor have room above them
-            plan = FloorPlan(((x, y), (right, y), (right, top), (x, top)), max(float(high[2]), 0.0) + _MARGIN_M)
-            low[:2], high[:2] = (x, y), (right, top)
+            if isinstance(responses, SimulatedResponses):
+                plan = responses.dataset.plan
+                corners = np.asarray(plan.corners)
+                low[:2], high[:2] = corners.min(axis=0), corners.max(axis=0)
+            else:
+                # guard: places on a line have room around them
+                (x, y), (right, top) = low[:2] - _MARGIN_M, high[:2] + _MARGIN_M
+                # guard: places on the floor have room above them
+                plan = FloorPlan(((x, y), (right, y), (right, top), (x, top)), max(float(high[2]), 0.0) + _MARGIN_M)
+                low[:2], high[:2] = (x, y), (right, top)
+            extent, surroundings = Extent.of_plan(plan), PlanSurroundings(plan)
         axes = [(0, 1, 2) if np.ptp(end[:, 2]) > _MOVES_M else (0, 1) for end in ends]
         # Rounded, so that a heading that was stored as slightly different floats counts once.
         yaws = np.unique(np.round(np.remainder(responses.yaw, 2 * np.pi), 6))
         headings = np.asarray(yaws[yaws < 2 * np.pi - 1e-5], np.float64)
-        return cls(plan, low, high, headings, axes[0], axes[1])
+        return cls(extent, surroundings, low, high, headings, axes[0], axes[1])

@@ -8,8 +8,10 @@ from tests.training.told_paths import told_paths
 from training.models.cells import Cells
 from training.models.directional import DirectionalField, ExportedDirections
 from training.models.encoders import FieldShape
+from training.models.site import Extent
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
+EXTENT = Extent.of_plan(PLAN)
 CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5), known_frames=0)
 SHAPE = FieldShape(rank=8, width=16, depth=2, grid_features=4)
 COLUMNS = CELLS.all_frames.cells
@@ -17,7 +19,7 @@ COLUMNS = CELLS.all_frames.cells
 
 def made(order=2):
     torch.manual_seed(0)
-    return DirectionalField(PLAN, CELLS, SHAPE, order).eval()
+    return DirectionalField(EXTENT, CELLS, SHAPE, order).eval()
 
 
 def places(count, seed=0):

@@ -8,9 +8,10 @@ from tests.training.told_paths import told_paths
 from training.models.cells import Cells
 from training.models.encoders import FeatureGrid, FieldShape, PoseEncoder
 from training.models.factorised import ExportedField, FactorisedField, Heads
-from training.models.site import Reach
+from training.models.site import Extent, Reach
 
 PLAN = FloorPlan(((0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)), 3.0)
+EXTENT = Extent.of_plan(PLAN)
 CELLS = Cells(Codec(16_000, 256, 64, 4_000, 1e-5), known_frames=12)
 SHAPE = FieldShape(rank=8, width=16, depth=2, grid_features=4)
 
@@ -18,7 +19,7 @@ SHAPE = FieldShape(rank=8, width=16, depth=2, grid_features=4)
 @pytest.fixture
 def field():
     torch.manual_seed(0)
-    return FactorisedField(PLAN, CELLS, SHAPE).eval()
+    return FactorisedField(EXTENT, CELLS, SHAPE).eval()
 
 
 def poses(count, seed=0):
@@ -39,14 +40,14 @@ def test_heads_tile_the_output():
 
 @pytest.mark.parametrize("distance_m", [0, 1e3, 1e6])
 def test_the_grid_reads_a_mean_of_its_features_however_far_away(distance_m):
-    grid = FeatureGrid(PLAN, 0.5, 4)
+    grid = FeatureGrid(EXTENT, 0.5, 4)
     read = grid(torch.tensor([[distance_m, -distance_m, 1.0], [-distance_m, 2.0, 1.0]]))
     assert (read <= grid._features.amax(dim=0) + 1e-6).all()
     assert (read >= grid._features.amin(dim=0) - 1e-6).all()
 
 
 def test_the_grid_reads_mostly_its_nearest_node():
-    grid = FeatureGrid(PLAN, 0.5, 4)
+    grid = FeatureGrid(EXTENT, 0.5, 4)
     with torch.no_grad():
         grid._features.copy_(grid._nodes.sum(dim=1, keepdim=True).expand(-1, 4))
     inner = torch.tensor([[2.2, 2.6, 0.0], [1.0, 1.5, 0.0]])
@@ -63,7 +64,7 @@ def test_turning_by_a_full_turn_changes_nothing(field):
 
 def test_the_head_meets_the_azimuth_it_turned_to():
     """Looking at the emitter, the encoder sees azimuth zero whatever the compass says."""
-    encoder = PoseEncoder(PLAN, SHAPE, Reach.throughout(PLAN))
+    encoder = PoseEncoder(EXTENT, SHAPE, Reach.throughout(EXTENT))
     listener = torch.tensor([[1.0, 1.0, 1.5]]).repeat(3, 1)
     angle = torch.tensor([0.0, 0.5, 1.2])
     emitter = listener + torch.stack([0.8 * torch.cos(angle), 0.8 * torch.sin(angle), torch.zeros(3)], dim=-1)
@@ -77,7 +78,7 @@ def test_what_was_not_learned_is_what_was_learned_next_to_it():
     """Beyond all probes, and nearer to each other than any two of them."""
     reach = Reach(np.array([0.4, 0.4, 1.1]), np.array([5.6, 4.6, 1.9]), 0.7)
     torch.manual_seed(0)
-    field = FactorisedField(PLAN, CELLS, SHAPE, reach=reach).eval()
+    field = FactorisedField(EXTENT, CELLS, SHAPE, reach=reach).eval()
     yaw = torch.zeros(1)
 
     def coefficients(listener, emitter):

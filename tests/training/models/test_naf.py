@@ -4,13 +4,22 @@ import torch
 
 from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
+from server.acoustics.surroundings import PlanSurroundings
 from training.models.local_geometry import GaussianGrid, OrientationEmbedding, sinusoids
 from training.models.naf import Naf, NafShape
 from training.models.naf_graph import NafGraph
-from training.models.site import Site
+from training.models.site import Extent, Site
 
 PLAN = FloorPlan(((0, 0), (4, 0), (4, 3), (0, 3)), 2.5)
-SITE = Site(PLAN, np.array([0, 0, 1.2]), np.array([4, 3, 1.8]), np.arange(4) * np.pi / 2, (0, 1, 2), (0, 1))
+SITE = Site(
+    Extent.of_plan(PLAN),
+    PlanSurroundings(PLAN),
+    np.array([0, 0, 1.2]),
+    np.array([4, 3, 1.8]),
+    np.arange(4) * np.pi / 2,
+    (0, 1, 2),
+    (0, 1),
+)
 CODEC = Codec(16_000, 512, 128, 2_000, 1e-5)
 SIZES = (CODEC.bins, CODEC.frames)
 

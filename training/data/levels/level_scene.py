@@ -4,6 +4,7 @@
 are above the floor that is below them. Doors stand as they are at the beginning.
 """
 
+import hashlib
 import json
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
@@ -106,6 +107,12 @@ class LevelScene:
     @property
     def simulation(self) -> Simulation:
         return self.file.simulation
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What the file says, and digests of the meshes."""
+        meshes = [hashlib.sha256(mesh.to_bytes()).hexdigest() for mesh in (self.mesh, *self.doors)]
+        return {**self.file.model_dump(mode="json"), "meshes": meshes}
 
     @cached_property
     def place(self) -> MeshGeometry:
