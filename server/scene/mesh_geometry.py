@@ -56,9 +56,14 @@ class MeshGeometry:
             self.mesh, {name: material.model_copy(update=smooth) for name, material in self.materials.items()}
         )
 
+    @property
+    def in_order(self) -> tuple[Material, ...]:
+        """The materials in the order in which the mesh numbers them."""
+        return tuple(self.materials[name] for name in self.mesh.materials)
+
     def of_surfaces(self, name: str) -> npt.NDArray[np.float64]:
         """(material, band) `absorption` or `scattering`, in the order of the mesh's materials."""
-        return np.array([getattr(self.materials[each], name) for each in self.mesh.materials], dtype=np.float64)
+        return np.array([getattr(each, name) for each in self.in_order], dtype=np.float64)
 
 
 def triangulated(corners: tuple[PlanPoint, ...]) -> _Integers:

@@ -42,9 +42,7 @@ class DirectPaths:
         walls: WallLosses | None
         if isinstance(scene, LevelScene):
             surroundings = scene.surroundings
-            walls = MeshWallLosses(
-                surroundings.tree, wall_losses_db([scene.place.materials[name] for name in scene.place.mesh.materials])
-            )
+            walls = MeshWallLosses(surroundings.tree, wall_losses_db(scene.place.in_order))
         else:
             assert isinstance(scene, SceneFile)
             surroundings = PlanSurroundings(scene.geometry.floor_plan)

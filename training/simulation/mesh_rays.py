@@ -2,6 +2,15 @@
 
 Axes are those of that module. Both sides of a triangle reflect. A ray that meets nothing more, under the
 open sky or beyond a hole, is lost.
+
+Walls may let energy through, which goes on in its direction. Absorption is all that is not reflected, so what goes
+through is part of it: the share of the mass law, and no more than a wall absorbs. The rest becomes heat. A wall counts
+once, as it does for the direct sound: from the face at which it is entered to the back of the next surface. It lets
+through what the more reluctant of its two sides does, which is the same from both.
+
+Of all walls that a ray meets, one is drawn, by the square root of the energy that would go through; there a second ray
+goes on, for all those that might have. Of every two of these, one is followed to a further wall. So there are at most
+two rays more for each on average, however many walls there are, and no energy is lost.
 """
 
 import math
@@ -10,8 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.mesh_tree import MeshTree
-from server.acoustics.mesh_tree_kernel import STACK, Tree, closest_hit, first_blocker
+from server.acoustics.decibels import db_to_power
+from server.acoustics.mesh_tree import SAME_PLACE_M, MeshTree
+from server.acoustics.mesh_tree_kernel import STACK, Tree, closest_hit, cross_all, first_blocker
 from server.kernels.compiled import compiled, compiled_loosely
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.dataset import SPEED_OF_SOUND
@@ -39,6 +49,10 @@ _MARGIN_M = 1e-6
 _MOST_LOOKS = 20_000_000
 # What reaches into the space between a triangle and a receiver by less than this does not.
 _TOUCH_M = 1e-9
+# The share of rays behind a wall that are followed through a further one.
+_FOLLOWED = 0.5
+# The most faces that are told apart in one place.
+_MOST_TOGETHER = 16
 
 
 class _Place(NamedTuple):
@@ -75,18 +89,27 @@ class MeshRayTracer:
         image_order: int,
         arrival_directions: _Floats,
         tree: MeshTree | None = None,
+        losses_db: npt.ArrayLike | None = None,
     ) -> None:
         """Prepare tracing for `duration_s`. Direct sound and specular paths of up to `image_order` reflections are left
-        out, because image sources give them. `tree` is the mesh's, if there is one already."""
+        out, because image sources give them; those that were reflected and went through a wall are not. `tree` is the
+        mesh's, if there is one already.
+
+        `losses_db` (material, band) is what walls take from sound that goes through them, infinite where none does.
+        Without it, no energy goes through walls."""
         mesh, tree = geometry.mesh, tree or MeshTree(geometry.mesh)
         order = tree.tree.numbers
+        absorbed = geometry.of_surfaces("absorption")
+        through = np.zeros_like(absorbed) if losses_db is None else db_to_power(-np.asarray(losses_db, np.float64))
+        through = np.minimum(through, absorbed)
         self._place = _Place(
             tree.tree,
             np.ascontiguousarray(mesh.normals[order]),
             np.ascontiguousarray(mesh.surfaces[order]),
-            1 - geometry.of_surfaces("absorption"),
+            1 - absorbed,
             geometry.of_surfaces("scattering"),
         )
+        self._through = through if through.any() else None
         positions = np.ascontiguousarray(receivers, dtype=np.float64)
         radii = np.minimum(tree.distance_m(positions), LARGEST_RADIUS_M)
         is_few = len(positions) * len(order) ** 2 <= _MOST_LOOKS
@@ -108,6 +131,7 @@ class MeshRayTracer:
         energy = np.zeros((len(self._receivers.positions), self._bins, self._directions, BANDS), dtype=np.float32)
         _trace(
             self._place,
+            self._through,
             self._receivers,
             np.asarray(emitter, dtype=np.float64),
             sphere_directions(rays) @ turn,
@@ -121,6 +145,7 @@ class MeshRayTracer:
 @compiled_loosely
 def _trace(
     place: _Place,
+    let: _Floats | None,
     receivers: _Receivers,
     emitter: _Floats,
     directions: _Floats,
@@ -128,60 +153,146 @@ def _trace(
     rng: np.random.Generator,
     histogram: Histogram,
 ) -> None:
-    """Add the energy of all rays to the histogram."""
+    """Add the energy of all rays to the histogram. `let` (material, band) is the share that may go through walls of a
+    material; None compiles code that does without."""
     tree, rays = place.tree, len(directions)
     end_m = histogram.energy.shape[1] * histogram.bin_m
     stack = np.empty(STACK, np.int32)
     blockers = np.full(len(receivers.positions), -1, np.int32)
     kept, chance, weight = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
-    scale = 1.0 / rays
+    drawn_kept, drawn_chance, through = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
     for ray in range(rays):
         px, py, pz = emitter[0], emitter[1], emitter[2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        scale = 1.0 / rays
         kept[:] = 1.0
         chance[:] = 1.0
         weight[:] = scale
         share, travelled_m, reflections, plane = 1.0, 0.0, 0, -1  # the share of such rays that is still followed
         was_scattered, is_mirrored = False, True  # at any reflection so far; at the last one
+        went_through, is_through = False, False  # at any wall so far; after the last reflection
         while True:
-            length, row, is_face = closest_hit(tree, stack, px, py, pz, dx, dy, dz, 1e-9, math.inf, plane)
-            length = max(length, 0.0)
-            # Scattered energy reaches receivers as diffuse rain, and image sources account for the first reflections.
-            if is_mirrored and (was_scattered or reflections > image_order):
-                add_crossings(receivers, (px, py, pz), (dx, dy, dz), length, travelled_m, weight, histogram)
-            if row < 0:
-                break  # it left, under the open sky or through a hole
-            px, py, pz = px + length * dx, py + length * dy, pz + length * dz
-            travelled_m += length
-            if travelled_m >= end_m:
-                break
-            reflections += 1
-            plane, surface = tree.planes[row], place.surfaces[row]
-            side = 1.0 if is_face else -1.0
-            normal = side * place.normals[row, 0], side * place.normals[row, 1], side * place.normals[row, 2]
-            for band in range(BANDS):
-                weight[band] *= place.reflected[surface, band]
-            first = int(rng.random() * EVERY)
-            _add_rain(
-                place, receivers, stack, blockers, first, row, (px, py, pz), normal, travelled_m, weight, histogram
-            )
-            is_scattered = rng.random() < place.scattered[surface, ray % BANDS]
-            loudest = weigh(place, surface, is_scattered, kept, chance, weight)
-            if loudest <= 0.0:
-                break
-            wanted = loudest**THINNING
-            if wanted < share:
-                if rng.random() * share >= wanted:
+            # Of the walls that the ray meets, the one through which it is to go on: drawn by its part of `all_drawn`.
+            all_drawn, of_drawn, drawn_share = 0.0, 0.0, 1.0
+            drawn_at, drawn_way, drawn_m = (px, py, pz), (dx, dy, dz), 0.0
+            drawn_row, drawn_face, drawn_reflections, drawn_scattered = -1, True, 0, False
+            while True:
+                length, row, is_face = closest_hit(tree, stack, px, py, pz, dx, dy, dz, 1e-9, math.inf, plane)
+                length = max(length, 0.0)
+                # Scattered energy reaches receivers as diffuse rain, but not through walls. Image sources account for
+                # the first reflections, and direct paths for what was never reflected.
+                is_late = was_scattered or went_through or reflections > image_order
+                if reflections > 0 and (is_through or (is_mirrored and is_late)):
+                    add_crossings(receivers, (px, py, pz), (dx, dy, dz), length, travelled_m, weight, histogram)
+                if row < 0:
+                    break  # it left, under the open sky or through a hole
+                px, py, pz = px + length * dx, py + length * dy, pz + length * dz
+                travelled_m += length
+                if travelled_m >= end_m:
                     break
-                share = wanted
+                plane, surface = tree.planes[row], place.surfaces[row]
+                if let is not None:
+                    loudest = 0.0
+                    for band in range(BANDS):
+                        loudest = max(loudest, kept[band] * chance[band] * let[surface, band])
+                    part = math.sqrt(loudest) / share
+                    all_drawn += part
+                    if part > 0.0 and rng.random() * all_drawn < part:
+                        of_drawn, drawn_share = part, share
+                        drawn_at, drawn_way, drawn_m = (px, py, pz), (dx, dy, dz), travelled_m
+                        drawn_row, drawn_face = row, is_face
+                        drawn_reflections, drawn_scattered = reflections, was_scattered
+                        drawn_kept[:] = kept
+                        drawn_chance[:] = chance
+                reflections += 1
+                side = 1.0 if is_face else -1.0
+                normal = side * place.normals[row, 0], side * place.normals[row, 1], side * place.normals[row, 2]
+                for band in range(BANDS):
+                    weight[band] *= place.reflected[surface, band]
+                first = int(rng.random() * EVERY)
+                _add_rain(
+                    place, receivers, stack, blockers, first, row, (px, py, pz), normal, travelled_m, weight, histogram
+                )
+                is_scattered = rng.random() < place.scattered[surface, ray % BANDS]
+                loudest = weigh(place, surface, is_scattered, kept, chance, weight)
+                if loudest <= 0.0:
+                    break
+                wanted = loudest**THINNING
+                if wanted < share:
+                    if rng.random() * share >= wanted:
+                        break
+                    share = wanted
+                for band in range(BANDS):
+                    weight[band] *= scale / share
+                is_mirrored, is_through = not is_scattered, False
+                if is_scattered:
+                    was_scattered = True
+                    dx, dy, dz = _scattered_direction(normal, rng.random(), rng.random())
+                else:
+                    dx, dy, dz = mirrored_direction((dx, dy, dz), normal)
+            if drawn_row < 0:
+                break
+            if let is not None:
+                scale *= all_drawn / (of_drawn * drawn_share)
+                if went_through:
+                    if rng.random() >= _FOLLOWED:
+                        break
+                    scale /= _FOLLOWED
+                length, row = _go_through(place, let, stack, drawn_row, drawn_face, drawn_at, drawn_way, through)
+                loudest = 0.0
+                for band in range(BANDS):
+                    kept[band] = drawn_kept[band] * through[band]
+                    chance[band] = drawn_chance[band]
+                    loudest = max(loudest, kept[band] * chance[band])
+                travelled_m = drawn_m + length
+                if loudest <= 0.0 or travelled_m >= end_m:
+                    break
+                # Behind the wall, the ray is as many as it was before: it is thinned anew.
+                scale, share = scale * loudest, 1.0
+                for band in range(BANDS):
+                    kept[band] /= loudest
+                    weight[band] = kept[band] * chance[band] * scale
+                dx, dy, dz = drawn_way
+                px, py, pz = drawn_at[0] + length * dx, drawn_at[1] + length * dy, drawn_at[2] + length * dz
+                plane, reflections, was_scattered = tree.planes[row], drawn_reflections, drawn_scattered
+                went_through, is_through = True, True
+
+
+@compiled_loosely
+def _go_through(
+    place: _Place,
+    let: _Floats,
+    stack: _Integers,
+    row: int,
+    is_face: bool,
+    position: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    through: _Floats,
+) -> tuple[float, int]:
+    """Set the share (band,) that goes through a wall which a ray meets at the triangle of a row in the tree. Returns
+    the way inside the wall, and the row of the triangle where the ray leaves it."""
+    tree, surface, plane = place.tree, place.surfaces[row], place.tree.planes[row]
+    px, py, pz = position
+    dx, dy, dz = direction
+    for band in range(BANDS):
+        through[band] = let[surface, band]
+    # Coplanar double faces are one sheet. `cross_all` tells faces from backs by the sign.
+    distances, rows = np.empty(_MOST_TOGETHER), np.empty(_MOST_TOGETHER, np.int32)
+    met = cross_all(tree, stack, px, py, pz, dx, dy, dz, -SAME_PLACE_M, SAME_PLACE_M, distances, rows)
+    for other in range(min(met, _MOST_TOGETHER)):
+        if (rows[other] >= 0) != is_face:
+            surface = place.surfaces[rows[other] if rows[other] >= 0 else -1 - rows[other]]
             for band in range(BANDS):
-                weight[band] *= scale / share
-            is_mirrored = not is_scattered
-            if is_scattered:
-                was_scattered = True
-                dx, dy, dz = _scattered_direction(normal, rng.random(), rng.random())
-            else:
-                dx, dy, dz = mirrored_direction((dx, dy, dz), normal)
+                through[band] = min(through[band], let[surface, band])
+            return 0.0, row
+    if not is_face:
+        return 0.0, row
+    length, leaves, is_next_face = closest_hit(tree, stack, px, py, pz, dx, dy, dz, 1e-9, math.inf, plane)
+    if leaves < 0 or is_next_face:
+        return 0.0, row
+    for band in range(BANDS):
+        through[band] = min(through[band], let[place.surfaces[leaves], band])
+    return max(length, 0.0), leaves
 
 
 @compiled_loosely

@@ -12,6 +12,7 @@ from server.acoustics.surroundings import MeshSurroundings
 from server.scene.geometry import Geometry
 from server.scene.manifest import Air
 from server.scene.mesh_geometry import MeshGeometry
+from server.scene.surfaces import wall_losses_db
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
@@ -106,9 +107,11 @@ class RoomTracer:
         arrival_directions: _Floats,
         least_order: int = 1,
         surroundings: MeshSurroundings | None = None,
+        through_walls: bool = False,
     ) -> None:
         """Specular paths of up to `image_order` reflections are found as images; those of fewer than `least_order` are
-        left out. In a mesh, the order is at most 1; its `surroundings` may be given if there are some already."""
+        left out. In a mesh, the order is at most 1; its `surroundings` may be given if there are some already, and
+        energy goes `through_walls` by the masses of its materials. In a floor plan, none does."""
         self._air = air
         self._receivers = np.asarray(receivers, dtype=np.float64)
         self._duration_s = duration_s
@@ -126,6 +129,7 @@ class RoomTracer:
                 image_order=image_order,
                 arrival_directions=arrival_directions,
                 tree=here.tree,
+                losses_db=wall_losses_db(geometry.in_order) if through_walls else None,
             )
         else:
             self._images = _PlanImages(geometry, self._receivers, least_order=least_order, order=image_order)
@@ -165,6 +169,7 @@ class RoomTracer:
             arrival_directions=sphere_directions(settings.arrival_directions),
             least_order=least_order,
             surroundings=surroundings,
+            through_walls=plan.transmission,
         )
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:

@@ -54,7 +54,9 @@ def house(absorption, scattering):
 EMITTER, RECEIVERS = np.array([1.0, 1.0, 1.2]), np.array([(4.4, 3.2, 1.4), (1.2, 3.0, 2.9), (4.0, 2.6, 2.4)])
 
 
-def traced(geometry, emitter, receivers, *, rays=3000, seed=0, image_order=0, duration_s=0.4, directions=12):
+def traced(
+    geometry, emitter, receivers, *, rays=3000, seed=0, image_order=0, duration_s=0.4, directions=12, losses_db=None
+):
     """(receiver, direction, band, bin)"""
     tracer = MeshRayTracer(
         geometry,
@@ -62,6 +64,7 @@ def traced(geometry, emitter, receivers, *, rays=3000, seed=0, image_order=0, du
         duration_s=duration_s,
         image_order=image_order,
         arrival_directions=sphere_directions(directions),
+        losses_db=losses_db,
     )
     return tracer.trace(emitter, rays=rays, rng=np.random.default_rng(seed))
 
@@ -232,3 +235,95 @@ def test_a_material_may_be_changed_for_all_triangles_of_its_name():
     quieter = replace(place, materials={ROUGH: material(0.9, 0.5)})
     loud, quiet = (traced(each, EMITTER, RECEIVERS).sum() for each in (place, quieter))
     assert power_to_db(quiet / loud) < -8
+
+
+PANEL, LINING = "panel", "lining"
+
+
+def two_rooms(*, wall_m, absorption, panel, lining=None):
+    """Rooms of 3 x 3 x 2.5 m and 4 x 3 x 2.5 m, and a wall between them: a sheet, or `wall_m` thick. Its sides are of
+    PANEL, or the second one of LINING. What goes into a thick wall at its edge leaves it outside of the rooms."""
+    rooms = [(CUBE * (size_x, 3, 2.5) + (x, 0, 0)) for size_x, x in ((3, 0), (4, 3 + wall_m))]
+    west, east = INWARDS[[0, 1]], INWARDS[[2, 3]]
+    rest = [np.delete(INWARDS, at, axis=0) for at in ((2, 3), (0, 1))]
+    materials = {ROUGH: material(absorption, 1.0), PANEL: panel, LINING: lining or panel}
+    for faces, x in ((west, 0), (east, 1)):
+        assert np.all(CUBE[faces][..., 0] == x)
+    second = [(rooms[1], west, LINING if lining else PANEL)] if wall_m else []
+    return place_of(
+        (rooms[0], rest[0], ROUGH), (rooms[1], rest[1], ROUGH), (rooms[0], east, PANEL), *second, **materials
+    )
+
+
+def losses_db(*of_materials):
+    """(material, band) of ROUGH, PANEL and LINING; nothing goes through the first."""
+    return np.repeat([[np.inf], *([each] for each in of_materials)], 7, axis=1)
+
+
+IN_BOTH = np.array([(0.8, 1.0, 1.2), (2.0, 2.2, 1.5), (4.6, 2.0, 1.0), (6.0, 1.0, 1.4)])
+SOURCE = np.array([1.4, 0.8, 1.7])
+
+
+@pytest.mark.parametrize("wall_m", [0.0, 0.01])
+def test_energy_that_goes_through_a_wall_is_not_lost(wall_m):
+    """All that the wall absorbs goes through, and the other walls absorb nothing: in the end both rooms are as full."""
+    place = two_rooms(wall_m=wall_m, absorption=0.0, panel=material(0.3, 0.4))
+    loss = losses_db(*[-power_to_db(0.3)] * 2)
+    energy = traced(place, SOURCE, IN_BOTH, rays=6000, losses_db=loss).sum(axis=1).mean(axis=1)
+    expected = 4 * np.pi * 343 * HISTOGRAM_BIN_S / (7 * 3 * 2.5)
+    in_rooms = power_to_db(energy.reshape(2, 2, -1)[..., 50:].mean(axis=(1, 2)) / expected)
+    np.testing.assert_allclose(in_rooms, 0, atol=0.3)
+
+
+@pytest.mark.parametrize(("wall_m", "loss_db"), [(0.0, 12.0), (0.02, 25.0), (0.02, 45.0)])
+def test_the_level_behind_a_wall_follows_its_transmission_loss(wall_m, loss_db):
+    """TL + 10 log10(A / S) between two reverberant rooms."""
+    place = two_rooms(wall_m=wall_m, absorption=0.06, panel=material(0.08, 1.0))
+    energy = traced(place, SOURCE, IN_BOTH, rays=4000, duration_s=1.0, losses_db=losses_db(loss_db, loss_db))
+    levels_db = power_to_db(energy.sum(axis=(1, 3)).mean(axis=1).reshape(2, 2).mean(axis=1))
+    wall_m2 = 3 * 2.5
+    # In the receiving room, the energy is what the walls reflect: of what comes through, none is heard directly.
+    absorbed_m2 = 0.06 * (2 * (4 * 3 + 4 * 2.5) + wall_m2) + 0.08 * wall_m2
+    assert levels_db[0] - levels_db[1] == pytest.approx(loss_db + power_to_db(absorbed_m2 / wall_m2), abs=1.0)
+
+
+def test_no_more_goes_through_a_wall_than_either_side_absorbs_and_lets_through():
+    panel, lining = material(0.2, 0.5), material(0.05, 0.5)
+    bare = two_rooms(wall_m=0.1, absorption=0.05, panel=lining)
+    lined = two_rooms(wall_m=0.1, absorption=0.05, panel=panel, lining=lining)
+    there = IN_BOTH[2:]
+
+    def level_db(place, loss, emitter=SOURCE, receivers=there):
+        energy = traced(place, emitter, receivers, rays=6000, losses_db=loss)
+        return power_to_db(np.maximum(energy.sum(axis=(1, 2, 3)), 1e-12)).mean()
+
+    # Of a wall that would let nearly all through, as much goes through as its lining absorbs.
+    assert level_db(bare, losses_db(0.1, 0.1)) == pytest.approx(level_db(bare, losses_db(13.01, 13.01)), abs=1e-3)
+    heard = [level_db(lined, losses_db(*each)) for each in ((25.0, 14.0), (14.0, 25.0), (25.0, 25.0))]
+    np.testing.assert_allclose(heard, heard[2], atol=1e-9)
+    assert level_db(lined, losses_db(20.0, np.inf)) == level_db(lined, losses_db(np.inf, 20.0)) < -119
+    assert level_db(lined, None) < -119
+
+
+def test_energy_through_walls_is_the_same_the_other_way_round():
+    place = two_rooms(wall_m=0.1, absorption=0.1, panel=material(0.2, 0.3), lining=material(0.1, 0.6))
+    there, back = (
+        traced(place, a, b[None], rays=20_000, losses_db=losses_db(20.0, 20.0)).sum(axis=(1, 3)).mean()
+        for a, b in ((SOURCE, IN_BOTH[3]), (IN_BOTH[3], SOURCE))
+    )
+    assert power_to_db(there / back) == pytest.approx(0, abs=0.3)
+
+
+def test_what_a_mirror_sends_through_a_sheet_has_the_level_of_a_free_wave_and_the_direct_sound_is_left_out():
+    """The images of one surface are those in sight, so this one is the rays'."""
+    plane = np.array([(-20, -20, 0), (20, -20, 0), (20, 20, 0), (-20, 20, 0)], dtype=float)
+    above, faces = plane + np.array((0, 0, 1.5)), [(0, 1, 2), (0, 2, 3)]
+    place = place_of(
+        (plane, faces, MIRROR), (above, faces, PANEL),
+        **{MIRROR: material(0.36, 0.0), PANEL: material(1.0, 0.0)},
+    )  # fmt: skip
+    emitter, receiver = np.array([0.0, 0.0, 1.0]), np.array([[1.0, 0.0, 2.0]])
+    loss = np.repeat([[np.inf], [-power_to_db(0.25)]], 7, axis=1)
+    energy = traced(place, emitter, receiver, rays=200_000, image_order=1, losses_db=loss)[0, :, 0].sum(axis=0)
+    assert np.flatnonzero(energy).tolist() == [int(np.sqrt(10) / 343 / HISTOGRAM_BIN_S)]
+    assert power_to_db(energy.sum() * 10 / (0.64 * 0.25)) == pytest.approx(0, abs=0.5)
