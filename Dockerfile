@@ -43,7 +43,7 @@ RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-dep
 # another processor a container compiles at its start, a matter of half a minute, and keeps that in /cache if it may write there.
 WORKDIR /
 RUN /opt/nafir/bin/python -c "from server.rendering.warm_up import warm_up; warm_up([256])" \
-    && /opt/nafir/bin/python -c "from server.acoustics.surroundings import compile_meshes; compile_meshes()" \
+    && /opt/nafir/bin/python -c "from server.acoustics.doors import compile_doors; compile_doors()" \
     && for scene in /opt/nafir/lib/python3*/site-packages/server/scene/bundles/*/; do \
         /opt/nafir/bin/python -m server.api.first_start "$scene" || exit 1; \
     done

@@ -67,9 +67,9 @@ def _compile_responses() -> None:
 
 
 def _compile_meshes() -> None:
-    from server.acoustics.surroundings import compile_meshes
+    from server.acoustics.doors import compile_doors
 
-    compile_meshes()
+    compile_doors()
 
 
 _PARTS = {

@@ -19,13 +19,14 @@ from server.acoustics.geometry import Vector3
 from server.acoustics.mesh import TriangleMesh
 from server.acoustics.mesh_edges import Bends, StillEdges
 from server.acoustics.mesh_tree import MeshTree
-from server.acoustics.surroundings import MeshSurroundings
+from server.acoustics.surroundings import MeshSurroundings, compile_meshes
 from server.core.bounded_cache import BoundedCache
 
 _Floats = npt.NDArray[np.float64]
 Openness = tuple[float, ...]
 """Of each door, from 0 to 1."""
-_KEPT_STATES = 32
+_KEPT_STATES = 8
+"""Ways round the edges of a house take four megabytes in each."""
 _WAYS_OF_A_SWING = np.linspace(0.0, 1.0, 5)
 _SHRUNK = 0.9
 """Leaves touch their frames; points on this share of them do not."""
@@ -67,6 +68,15 @@ class DoorLeaf:
         """(n, 3) points on the leaf as it opens, a little inside of its outline."""
         at = [self.motion.moved(self.mesh.vertices_m, float(openness)) for openness in _WAYS_OF_A_SWING]
         return np.concatenate([middle + _SHRUNK * (each - middle) for each in at for middle in [each.mean(axis=0)]])
+
+
+def compile_doors() -> None:
+    """Compile the code by which meshes with doors are asked, or load it from disk."""
+    compile_meshes()
+    corners = np.array([(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+    sheet = TriangleMesh(corners, np.arange(3, dtype=np.int32)[None], np.zeros(1, np.int32), ("sheet",))
+    slide = LeafMotion("slide", (0.0, 0.0, 0.0), 0.0, (1.0, 0.0, 0.0))
+    MeshWithDoors(sheet, [DoorLeaf(sheet, slide)], open_sky=True).at((0.5,))
 
 
 class MeshWithDoors:

@@ -16,7 +16,7 @@ from server.scene.bundle import Bundle
 from server.scene.limits import STREAM_RATES_HZ
 from server.scene.manifest import CodecParameters
 
-_KEPT_STATES = 16
+_KEPT_STATES = 4
 """States of doors whose levels are kept."""
 
 

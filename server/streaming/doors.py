@@ -63,7 +63,9 @@ class FollowedDoors:
         self.openness = read_openness(self._doors, wanted)
         """How far doors are to be open."""
         self._heard = self._ways_are_of = levels.bundle.openness
-        self._ways = moving.at(self._heard)
+        surroundings = levels.bundle.surroundings  # which are there already
+        assert isinstance(surroundings, MeshSurroundings)
+        self._ways = surroundings
         self._are_newest_ways_heard = True
         self._soon_in_flight = self._whole_in_flight = False
         self.is_heard = self._heard == self.openness

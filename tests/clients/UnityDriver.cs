@@ -59,6 +59,8 @@ static class UnityDriver
                     NafirWire.AddEmitter("voice", new NafirSource { Pose = pose, JitterMs = 40 }),
                     NafirWire.StopEmitter("x", 5000, 0.5f, 1000), NafirWire.StopEmitter("x", null, 0.01f), NafirWire.SetGain("x", -6, 2.5f),
                     NafirWire.SetLevel("auto"), NafirWire.Ping(9), NafirWire.Hello("flat", 0, 512, 8, pose, "fine"),
+                    NafirWire.SetDoor("kitchen", 0.25f),
+                    NafirWire.Hello("flat", 0, 512, 8, pose, null, new Dictionary<string, float> { { "kitchen", 0.25f }, { "hall", 1 } }),
                 });
             case "json":
                 try

@@ -121,8 +121,11 @@ func _texts(core):
 	stream.set_emitter("mine", null, core.make_pose(Vector3(1, 2, 3), Quat(0, 0, 0, 1)), -6.0)
 	stream.step(0.1)
 	stream.remove_emitter("mine")
+	stream.set_door("kitchen", 0.25)
+	stream.set_door("kitchen", 0.25)
 	for each in stream.texts:
 		print(to_json(each))
+	print(to_json(stream.hello()))
 	return _equal("a pose was sent", stream.packets.size(), 1)
 
 

@@ -191,7 +191,9 @@ int main() {
                 << nafir::message::SetGain("x", -6, 2.5) << '\n'
                 << nafir::message::SetLevel("auto") << '\n'
                 << nafir::message::Ping(9) << '\n'
-                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, "fine", true) << '\n';
+                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, "fine", true) << '\n'
+                << nafir::message::SetDoor("kitchen", 0.25) << '\n'
+                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, {}, true, {{"hall", 1.0}, {"kitchen", 0.25}}) << '\n';
     } else if (command == "json") {
       std::getline(in >> std::ws, text);
       const auto read = nafir::Json::Parse(text);

@@ -59,6 +59,7 @@ var _listener = {"position": [0.0, 0.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0
 var _listener_moved = false
 var _emitters = {} # by id
 var _wanted_level = ""
+var _doors = {} # by name, how far those are open that were moved
 var _shots = 0
 var _pose_id = 0
 var _since_poses_s = 0.0
@@ -173,6 +174,14 @@ func set_gain(id, gain_db, ramp_s = 0.0):
 		_order({"type": "set_gain", "id": id, "gain_db": gain_db, "ramp_s": ramp_s})
 
 
+# Opens a door of the scene so far, from 0, shut, to 1. Call it with each frame while a door swings.
+func set_door(door, openness):
+	if _doors.get(door) == openness:
+		return
+	_doors[door] = openness
+	_order({"type": "set_door", "door": door, "openness": openness})
+
+
 # Lets a clip fade out from a clock on, or at once. `emitter_ended` follows.
 func stop_emitter(id, stop_at = -1, fade_s = 0.01):
 	if not _emitters.has(id) or _emitters[id].clip == null:
@@ -271,6 +280,8 @@ func hello():
 		message["sample_rate"] = wanted_rate
 	if _wanted_level != "":
 		message["level"] = _wanted_level
+	if len(_doors) > 0:
+		message["doors"] = _doors
 	return message
 
 

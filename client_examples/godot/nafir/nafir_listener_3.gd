@@ -61,6 +61,11 @@ func set_gain(id, gain_db, ramp_s = 0.0):
 	core.set_gain(id, gain_db, ramp_s)
 
 
+# Opens a door of the scene so far, from 0, shut, to 1.
+func set_door(door, openness):
+	core.set_door(door, openness)
+
+
 # Lets a clip fade out; `emitter_ended` follows.
 func stop_emitter(id, fade_s = 0.01):
 	core.stop_emitter(id, -1, fade_s)

@@ -77,6 +77,11 @@ func set_gain(id: String, gain_db: float, ramp_s := 0.0) -> void:
 	core.set_gain(id, gain_db, ramp_s)
 
 
+## Opens a door of the scene so far, from 0, shut, to 1.
+func set_door(door: String, openness: float) -> void:
+	core.set_door(door, openness)
+
+
 ## Lets a clip fade out; [signal emitter_ended] follows.
 func stop_emitter(id: String, fade_s := 0.01) -> void:
 	core.stop_emitter(id, -1, fade_s)

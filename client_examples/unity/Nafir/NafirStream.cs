@@ -34,6 +34,7 @@ namespace Nafir
         readonly CancellationTokenSource ending = new CancellationTokenSource();
         readonly Task running;
         readonly object gate = new object();
+        readonly Dictionary<string, float> doors = new Dictionary<string, float>();
         readonly Dictionary<string, Emitter> emitters = new Dictionary<string, Emitter>();
         readonly ConcurrentQueue<object> outgoing = new ConcurrentQueue<object>(); // string or byte[]
         readonly NafirOrders orders = new NafirOrders();
@@ -188,6 +189,17 @@ namespace Nafir
                 if (!emitters.TryGetValue(id, out var emitter)) return;
                 emitter.Source.GainDb = gainDb;
                 Order(NafirWire.SetGain(id, gainDb, rampS));
+            }
+        }
+
+        /// <summary>Opens a door of the scene so far, from 0, shut, to 1. Call it with each frame while a door swings.</summary>
+        public void SetDoor(string door, float openness)
+        {
+            lock (gate)
+            {
+                if (doors.TryGetValue(door, out var before) && before == openness) return;
+                doors[door] = openness;
+                Order(NafirWire.SetDoor(door, openness));
             }
         }
 
@@ -420,7 +432,7 @@ namespace Nafir
             lock (gate)
             {
                 if (CanResume) return NafirWire.Resume(token, snapshot, hasBlock ? block : null);
-                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel);
+                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel, doors);
             }
         }
 

@@ -1,7 +1,9 @@
 // Messages of /v1/stream, protocol 3: binary ones are little endian, text ones are JSON. Without a type of Unity's.
 
 using System;
+using System.Collections.Generic;
 using System.Globalization;
+using System.Linq;
 using System.Text;
 
 namespace Nafir
@@ -101,12 +103,15 @@ namespace Nafir
         }
 
         /// <summary>The first message. A `sampleRate` of 0 takes the scene's own, a `level` of null is the server's choice.</summary>
-        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null)
+        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null,
+            IReadOnlyDictionary<string, float> doors = null)
         {
             var rate = sampleRate > 0 ? $",\"sample_rate\":{sampleRate}" : "";
             var quality = level != null ? $",\"level\":{NafirJson.Quote(level)}" : "";
+            var open = doors != null && doors.Count > 0
+                ? $",\"doors\":{{{string.Join(",", doors.Select(each => $"{NafirJson.Quote(each.Key)}:{Text(each.Value)}"))}}}" : "";
             return $"{{\"type\":\"hello\",\"protocol\":{Protocol},\"scene\":{NafirJson.Quote(scene)},\"block_size\":{blockSize},\"encoding\":\"s16\","
-                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}}}";
+                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}{open}}}";
         }
 
         /// <summary>The first message of a connection that goes on with a lost stream. `token` is that of the last welcome, `snapshot` the newest
@@ -140,6 +145,10 @@ namespace Nafir
 
         public static string SetGain(string id, float gainDb, float rampS = 0) =>
             $"{{\"type\":\"set_gain\",\"id\":{NafirJson.Quote(id)},\"gain_db\":{Text(gainDb)},\"ramp_s\":{Text(rampS)}}}";
+
+        /// <summary>Opens a door of the scene so far, from 0, shut, to 1.</summary>
+        public static string SetDoor(string door, float openness) =>
+            $"{{\"type\":\"set_door\",\"door\":{NafirJson.Quote(door)},\"openness\":{Text(openness)}}}";
 
         /// <summary>Lets a clip fade out from a clock on, or at once (null).</summary>
         public static string StopEmitter(string id, ulong? stopAt, float fadeS, ulong clockOffset = 0)

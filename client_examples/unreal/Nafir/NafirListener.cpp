@@ -236,6 +236,14 @@ void UNafirListener::SetGain(const FString& Id, float GainDb, float RampSeconds)
 	}
 }
 
+void UNafirListener::SetDoor(const FString& Door, float Openness)
+{
+	if (Session)
+	{
+		Session->SetDoor(ToText(Door), Openness);
+	}
+}
+
 void UNafirListener::StopEmitter(const FString& Id, float FadeSeconds)
 {
 	if (Session)

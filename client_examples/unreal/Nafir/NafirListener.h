@@ -72,6 +72,10 @@ public:
 	UFUNCTION(BlueprintCallable, Category = "Nafir")
 	void SetGain(const FString& Id, float GainDb, float RampSeconds = 0.0f);
 
+	/** Opens a door of the scene so far, from 0, shut, to 1. */
+	UFUNCTION(BlueprintCallable, Category = "Nafir")
+	void SetDoor(const FString& Door, float Openness);
+
 	/** Lets a clip fade out; OnEmitterEnded follows. */
 	UFUNCTION(BlueprintCallable, Category = "Nafir")
 	void StopEmitter(const FString& Id, float FadeSeconds = 0.01f);

@@ -139,6 +139,14 @@ class Session {
     Order(message::SetGain(id, gain_db, ramp_s));
   }
 
+  // Opens a door of the scene so far, from 0, shut, to 1. Call it with each frame while a door swings.
+  void SetDoor(const std::string& door, double openness) {
+    const auto found = doors_.find(door);
+    if (found != doors_.end() && found->second == openness) return;
+    doors_[door] = openness;
+    Order(message::SetDoor(door, openness));
+  }
+
   // Lets a clip fade out from a clock on, or at once. on_emitter_ended follows.
   void StopEmitter(const std::string& id, double fade_s = 0.01, std::optional<std::uint64_t> stop_at = std::nullopt) {
     const auto found = emitters_.find(id);
@@ -175,7 +183,7 @@ class Session {
 
   std::string FirstMessage() const {
     if (CanResume()) return message::Resume(token_, snapshot_, has_block_ ? &block_ : nullptr);
-    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true);
+    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true, doors_);
   }
 
   // The connection has ended, with a close code if there was one, or there came none.
@@ -516,6 +524,7 @@ class Session {
   bool listener_moved_ = false, is_trying_ = false, was_welcomed_ = false;
   bool is_to_drop_ = false;  // a connection that resumed a stream which cannot go on
   std::map<std::string, Emitter> emitters_;
+  std::map<std::string, double> doors_;
   std::deque<Outgoing> outgoing_;
   std::deque<std::string> orders_;  // the newest messages that the server counts, and how many there were
   std::uint64_t ordered_ = 0;

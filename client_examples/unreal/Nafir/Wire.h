@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <map>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -177,13 +178,22 @@ namespace message {
 // The first message. A `sample_rate` of 0 takes the scene's own; without a `level` the server chooses. With `snapshots` a server that has a
 // secret sends the stream's state now and then.
 inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener,
-                         std::string_view level = {}, bool snapshots = false) {
+                         std::string_view level = {}, bool snapshots = false,
+                         const std::map<std::string, double>& doors = {}) {
   std::string text = "{\"type\":\"hello\",\"protocol\":" + std::to_string(kProtocol) + ",\"scene\":" + wire::Quoted(scene) +
                      ",\"block_size\":" + std::to_string(block_size) + ",\"encoding\":\"" + NameOf(encoding) +
                      "\",\"buffer_blocks\":" + std::to_string(buffer_blocks) + ",\"listener\":{" + wire::Numbers(listener) + "}";
   if (sample_rate > 0) text += ",\"sample_rate\":" + std::to_string(sample_rate);
   if (!level.empty()) text += ",\"level\":" + wire::Quoted(level);
   if (snapshots) text += ",\"snapshots\":true";
+  if (!doors.empty()) {
+    const char* between = ",\"doors\":{";
+    for (const auto& [door, openness] : doors) {
+      text += between + wire::Quoted(door) + ":" + wire::Number(openness);
+      between = ",";
+    }
+    text += "}";
+  }
   return text + "}";
 }
 
@@ -247,6 +257,11 @@ inline std::string MoveEmitter(std::string_view id, std::uint32_t pose_id, const
 // The gain is reached over `ramp_s` seconds, linearly in decibels.
 inline std::string SetGain(std::string_view id, double gain_db, double ramp_s = 0) {
   return "{\"type\":\"set_gain\",\"id\":" + wire::Quoted(id) + ",\"gain_db\":" + wire::Number(gain_db) + ",\"ramp_s\":" + wire::Number(ramp_s) + "}";
+}
+
+// Opens a door of the scene so far, from 0, shut, to 1.
+inline std::string SetDoor(std::string_view door, double openness) {
+  return "{\"type\":\"set_door\",\"door\":" + wire::Quoted(door) + ",\"openness\":" + wire::Number(openness) + "}";
 }
 
 inline std::string RemoveEmitter(std::string_view id) { return "{\"type\":\"remove_emitter\",\"id\":" + wire::Quoted(id) + "}"; }
