@@ -59,8 +59,7 @@ static class UnityDriver
                     NafirWire.AddEmitter("voice", new NafirSource { Pose = pose, JitterMs = 40 }),
                     NafirWire.StopEmitter("x", 5000, 0.5f, 1000), NafirWire.StopEmitter("x", null, 0.01f), NafirWire.SetGain("x", -6, 2.5f),
                     NafirWire.SetLevel("auto"), NafirWire.Ping(9), NafirWire.Hello("flat", 0, 512, 8, pose, "fine"),
-                    NafirWire.SetDoor("kitchen", 0.25f),
-                    NafirWire.Hello("flat", 0, 512, 8, pose, null, new Dictionary<string, float> { { "kitchen", 0.25f }, { "hall", 1 } }),
+                    NafirWire.SetDoor("north \"1\"", 0.25f),
                 });
             case "json":
                 try
@@ -73,6 +72,7 @@ static class UnityDriver
                 }
             case "play": return Play(words.Select(each => (double)Number(each)).ToArray());
             case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]));
+            case "doors": return Doors(words[0], words[1]);
             case "shots": return Shots(words[0], words[1], words[2]);
             case "ending": return Ending(words[0], words[1], words[2]);
             case "microphone": return FromMicrophone(words[0], words[1]);
@@ -201,6 +201,29 @@ static class UnityDriver
     }
 
     static string Invariant(FormattableString text) => FormattableString.Invariant(text);
+
+    // Shuts a door before there is a stream and opens it twice the same while there is one, then wants a door that the scene lacks. Answers
+    // with how many more messages the server counts for that, its refusals, and whether the stream is live still.
+    static string Doors(string url, string scene)
+    {
+        var pose = NafirPose.FromUnity(new NafirVector(2, 1.5f, 2.5f), new NafirQuaternion(0, 0, 0, 1));
+        var refused = new ConcurrentQueue<object>();
+        using (var stream = new NafirStream(url, scene, 48000, pose))
+        {
+            stream.Received += message =>
+            {
+                if ((string)message["type"] == "error") refused.Enqueue(message["code"]);
+            };
+            stream.SetDoor("between", 0);
+            while (stream.SampleClock == 0) Thread.Sleep(10);
+            stream.SetDoor("between", 0.5f);
+            stream.SetDoor("between", 0.5f);
+            stream.SetDoor("attic", 1);
+            for (int i = 0; i < 500 && refused.IsEmpty; i++) Thread.Sleep(10);
+            var orders = (NafirOrders)typeof(NafirStream).GetField("orders", BindingFlags.Instance | BindingFlags.NonPublic).GetValue(stream);
+            return $"{orders.Count} {string.Join(",", refused)} {stream.State}";
+        }
+    }
 
     // Ten one-shots of a clip half a second apart, by the clock. Answers with how many ended, and what was refused.
     static string Shots(string url, string scene, string clip)

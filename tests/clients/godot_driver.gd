@@ -41,7 +41,7 @@ func _initialize():
 	var vectors = JSON.parse(file.get_as_text()).result
 	var is_right = (
 		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
-		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _doors(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
 	)
 	print("checked %d" % _checked)
 	quit(0 if is_right else 1)
@@ -121,11 +121,8 @@ func _texts(core):
 	stream.set_emitter("mine", null, core.make_pose(Vector3(1, 2, 3), Quat(0, 0, 0, 1)), -6.0)
 	stream.step(0.1)
 	stream.remove_emitter("mine")
-	stream.set_door("kitchen", 0.25)
-	stream.set_door("kitchen", 0.25)
 	for each in stream.texts:
 		print(to_json(each))
-	print(to_json(stream.hello()))
 	return _equal("a pose was sent", stream.packets.size(), 1)
 
 
@@ -161,6 +158,47 @@ func _resuming(core):
 		if not (_equal("is live", stream.state, "live") and _equal("the emitter is said", stream.texts.size(), 1)):
 			return false
 	return true
+
+
+# A door is moved before there is a stream, twice to the same place while there is one, and twice while it is lost. It is as the game has it
+# after a resumption, and in a stream that begins anew.
+func _doors(core):
+	var stream = core.new()
+	stream.set_door("kitchen", 0.75)
+	stream.begin()
+	stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "t"})
+	if not _equal("at first", _said_of_doors(stream), ["kitchen=0.75"]):
+		return false
+	stream.set_door("kitchen", 0.5)
+	stream.set_door("kitchen", 0.5)
+	stream.set_door("attic", 1.0)
+	print(to_json(stream.texts[0]))
+	if not _equal("while live", _said_of_doors(stream), ["kitchen=0.5", "attic=1"]):
+		return false
+	stream.lost("a cut")
+	stream.set_door("kitchen", 0.25)
+	stream.set_door("kitchen", 0.0)
+	stream.begin()
+	stream.receive({
+		"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "u",
+		"resumed": {"handled": 3.0, "sample_clock": 5000.0, "pose_id": 0.0},
+	})
+	if not _equal("resumed", _said_of_doors(stream), ["kitchen=0"]):
+		return false
+	stream.lost("another")
+	stream.begin()
+	stream.receive({"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "v"})
+	return _equal("anew", _said_of_doors(stream), ["kitchen=0", "attic=1"])
+
+
+# What waits to be sent of doors; it is taken out.
+func _said_of_doors(stream):
+	var said = []
+	for each in stream.texts:
+		if each.type == "set_door":
+			said.append("%s=%s" % [each.door, each.openness])
+	stream.texts.clear()
+	return said
 
 
 # A microphone's frames at 44.1 kHz become samples at 24 kHz, two frames later.

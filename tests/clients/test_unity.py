@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import parse_client_message
 from tests.clients.vectors import CLIENTS, TABLE, assert_same_poses, poses, readme_commands
+from tests.serving import serving
+from tests.two_rooms import write_two_rooms
 
 COMPILER, MONO = shutil.which("mcs"), shutil.which("mono")
 pytestmark = needs_mono = pytest.mark.skipif(
@@ -106,7 +109,7 @@ def test_text_messages_are_valid_and_say_what_was_meant(program):
 
 def test_messages_of_clips_and_of_resuming_are_valid_and_say_what_was_meant(program):
     [line] = answers(program, "texts")
-    resume, elsewhere, shot, loop, voice, stop, stop_now, ramp, level, ping, hello, door, again = map(
+    resume, elsewhere, shot, loop, voice, stop, stop_now, ramp, level, ping, hello, door = map(
         parse_client_message, line.split("\t")[8:]
     )
     assert (resume.token, resume.snapshot, resume.sequence) == ('a"b', None, None)
@@ -120,8 +123,8 @@ def test_messages_of_clips_and_of_resuming_are_valid_and_say_what_was_meant(prog
     assert (stop.stop_at, stop.fade_s, stop_now.stop_at) == (4000, 0.5, None)
     assert stop_now.fade_s == pytest.approx(0.01)
     assert (ramp.gain_db, ramp.ramp_s, level.level, ping.id) == (-6, 2.5, "auto", 9)
-    assert (hello.level, hello.snapshots, hello.doors) == ("fine", True, {})
-    assert (door.door, door.openness, again.doors) == ("kitchen", 0.25, {"kitchen": 0.25, "hall": 1.0})
+    assert (hello.level, hello.snapshots) == ("fine", True)
+    assert (door.door, door.openness) == ('north "1"', 0.25)
 
 
 def test_json_is_read_as_python_reads_it(program):
@@ -228,6 +231,12 @@ def test_the_components_play_in_a_game(program, served):
 
 def test_one_shots_and_what_is_stopped_end_and_a_refusal_is_told(program, served):
     assert answers(program, f"shots ws://{served}/v1/stream flat trumpet") == ["6  unknown_clip"]
+
+
+def test_doors_move_and_one_that_the_scene_lacks_is_told(program, tmp_path, hrtfs):
+    levels = FieldsByLevel.load(write_two_rooms(tmp_path / "scene"))
+    with serving(levels, hrtfs) as address:
+        assert answers(program, f"doors ws://{address}/v1/stream two-rooms") == ["3 unknown_door Live"]
 
 
 def test_a_clip_that_has_ended_does_not_begin_again_before_the_game_is_told(program, served):

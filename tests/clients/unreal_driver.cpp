@@ -120,6 +120,41 @@ void Resume(std::istream& in) {
   std::cout << name(session.FirstMessage()) << '\n';
 }
 
+// A door is moved before there is a stream, twice to the same place while there is one, and twice while it is lost; the stream is resumed,
+// and then begins anew. Answers with what is said of doors after each of these, a line each.
+void Doors() {
+  nafir::Session session({});
+  const auto tell = [&session] {
+    std::string said;
+    while (const auto message = session.Take()) {
+      const auto read = nafir::Json::Parse(message->data);
+      if (message->is_text && (*read)["type"].Text() == "set_door") {
+        said += (*read)["door"].Text() + '=' + nafir::wire::Number((*read)["openness"].Number()) + ' ';
+      }
+    }
+    std::cout << said << '\n';
+  };
+  const std::string welcome = R"({"type":"welcome","sample_rate":24000,"level":"standard","resume_token":"t")";
+  session.SetDoor("kitchen", 0.75);
+  session.Begin();
+  session.Receive(welcome + "}");
+  tell();
+  session.SetDoor("kitchen", 0.5);
+  session.SetDoor("kitchen", 0.5);
+  session.SetDoor("attic", 1);
+  tell();
+  session.Lost("a cut");
+  session.SetDoor("kitchen", 0.25);
+  session.SetDoor("kitchen", 0);
+  session.Begin();
+  session.Receive(welcome + R"(,"resumed":{"handled":3,"sample_clock":5000,"pose_id":0}})");
+  tell();
+  session.Lost("another");
+  session.Begin();
+  session.Receive(welcome + "}");
+  tell();
+}
+
 }  // namespace
 
 int main() {
@@ -192,8 +227,7 @@ int main() {
                 << nafir::message::SetLevel("auto") << '\n'
                 << nafir::message::Ping(9) << '\n'
                 << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, "fine", true) << '\n'
-                << nafir::message::SetDoor("kitchen", 0.25) << '\n'
-                << nafir::message::Hello("flat", 0, 512, nafir::Encoding::kInt16, 8, pose, {}, true, {{"hall", 1.0}, {"kitchen", 0.25}}) << '\n';
+                << nafir::message::SetDoor("north \"1\"", 0.25) << '\n';
     } else if (command == "json") {
       std::getline(in >> std::ws, text);
       const auto read = nafir::Json::Parse(text);
@@ -202,6 +236,8 @@ int main() {
       Play(in);
     } else if (command == "resume") {
       Resume(in);
+    } else if (command == "doors") {
+      Doors();
     }
     std::cout.flush();
   }

@@ -60,6 +60,7 @@ var _listener_moved = false
 var _emitters = {} # by id
 var _wanted_level = ""
 var _doors = {} # by name, how far those are open that were moved
+var _doors_moved = {} # names of those that were moved while there was no connection
 var _shots = 0
 var _pose_id = 0
 var _since_poses_s = 0.0
@@ -179,7 +180,14 @@ func set_door(door, openness):
 	if _doors.get(door) == openness:
 		return
 	_doors[door] = openness
-	_order({"type": "set_door", "door": door, "openness": openness})
+	if state == "live":
+		_order_door(door)
+	else:
+		_doors_moved[door] = true
+
+
+func _order_door(door):
+	_order({"type": "set_door", "door": door, "openness": _doors[door]})
 
 
 # Lets a clip fade out from a clock on, or at once. `emitter_ended` follows.
@@ -280,8 +288,6 @@ func hello():
 		message["sample_rate"] = wanted_rate
 	if _wanted_level != "":
 		message["level"] = _wanted_level
-	if len(_doors) > 0:
-		message["doors"] = _doors
 	return message
 
 
@@ -449,6 +455,9 @@ func _go_on(handled, clock, pose_id):
 	_handled(handled)
 	for each in _orders:
 		texts.append(each)
+	for door in _doors_moved:
+		_order_door(door)
+	_doors_moved.clear()
 	_pose_id = int(max(_pose_id, pose_id))
 	for id in _emitters:
 		var emitter = _emitters[id]
@@ -469,6 +478,9 @@ func _begin_anew():
 	_orders.clear()
 	_ordered = 0
 	_pose_id = 0
+	for door in _doors: # not in the hello: a door that the scene lacks would end the stream
+		_order_door(door)
+	_doors_moved.clear()
 	for id in _emitters.keys():
 		var emitter = _emitters[id]
 		if emitter.start >= 0 and _plays_once(emitter):

@@ -34,7 +34,8 @@ namespace Nafir
         readonly CancellationTokenSource ending = new CancellationTokenSource();
         readonly Task running;
         readonly object gate = new object();
-        readonly Dictionary<string, float> doors = new Dictionary<string, float>();
+        readonly Dictionary<string, float> doors = new Dictionary<string, float>(); // those that the game has moved
+        readonly HashSet<string> doorsMoved = new HashSet<string>(); // of them, while there was no connection
         readonly Dictionary<string, Emitter> emitters = new Dictionary<string, Emitter>();
         readonly ConcurrentQueue<object> outgoing = new ConcurrentQueue<object>(); // string or byte[]
         readonly NafirOrders orders = new NafirOrders();
@@ -199,7 +200,8 @@ namespace Nafir
             {
                 if (doors.TryGetValue(door, out var before) && before == openness) return;
                 doors[door] = openness;
-                Order(NafirWire.SetDoor(door, openness));
+                if (welcomed) Order(NafirWire.SetDoor(door, openness));
+                else doorsMoved.Add(door);
             }
         }
 
@@ -432,7 +434,7 @@ namespace Nafir
             lock (gate)
             {
                 if (CanResume) return NafirWire.Resume(token, snapshot, hasBlock ? block : null);
-                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel, doors);
+                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel);
             }
         }
 
@@ -530,6 +532,8 @@ namespace Nafir
             }
             counts.Resumptions++;
             foreach (var each in again) outgoing.Enqueue(each);
+            foreach (var door in doorsMoved) Order(NafirWire.SetDoor(door, doors[door]));
+            doorsMoved.Clear();
             poseId = Math.Max(poseId, (uint)(double)resumed["pose_id"]);
             foreach (var emitter in emitters.Values)
             {
@@ -551,6 +555,9 @@ namespace Nafir
             orders.Clear();
             snapshot = null;
             poseId = 0;
+            // Not in the hello: a door that the scene lacks would end the stream.
+            foreach (var pair in doors) Order(NafirWire.SetDoor(pair.Key, pair.Value));
+            doorsMoved.Clear();
             foreach (var pair in emitters)
             {
                 if (pair.Value.Heard && pair.Value.PlaysOnce) over.Add(pair.Key);

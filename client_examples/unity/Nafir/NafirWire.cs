@@ -1,9 +1,7 @@
 // Messages of /v1/stream, protocol 3: binary ones are little endian, text ones are JSON. Without a type of Unity's.
 
 using System;
-using System.Collections.Generic;
 using System.Globalization;
-using System.Linq;
 using System.Text;
 
 namespace Nafir
@@ -103,15 +101,12 @@ namespace Nafir
         }
 
         /// <summary>The first message. A `sampleRate` of 0 takes the scene's own, a `level` of null is the server's choice.</summary>
-        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null,
-            IReadOnlyDictionary<string, float> doors = null)
+        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null)
         {
             var rate = sampleRate > 0 ? $",\"sample_rate\":{sampleRate}" : "";
             var quality = level != null ? $",\"level\":{NafirJson.Quote(level)}" : "";
-            var open = doors != null && doors.Count > 0
-                ? $",\"doors\":{{{string.Join(",", doors.Select(each => $"{NafirJson.Quote(each.Key)}:{Text(each.Value)}"))}}}" : "";
             return $"{{\"type\":\"hello\",\"protocol\":{Protocol},\"scene\":{NafirJson.Quote(scene)},\"block_size\":{blockSize},\"encoding\":\"s16\","
-                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}{open}}}";
+                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}}}";
         }
 
         /// <summary>The first message of a connection that goes on with a lost stream. `token` is that of the last welcome, `snapshot` the newest

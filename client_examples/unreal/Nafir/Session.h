@@ -12,6 +12,7 @@
 #include <memory>
 #include <optional>
 #include <random>
+#include <set>
 #include <string>
 #include <string_view>
 #include <utility>
@@ -144,7 +145,11 @@ class Session {
     const auto found = doors_.find(door);
     if (found != doors_.end() && found->second == openness) return;
     doors_[door] = openness;
-    Order(message::SetDoor(door, openness));
+    if (state_ == State::kLive) {
+      Order(message::SetDoor(door, openness));
+    } else {
+      doors_moved_.insert(door);
+    }
   }
 
   // Lets a clip fade out from a clock on, or at once. on_emitter_ended follows.
@@ -183,7 +188,7 @@ class Session {
 
   std::string FirstMessage() const {
     if (CanResume()) return message::Resume(token_, snapshot_, has_block_ ? &block_ : nullptr);
-    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true, doors_);
+    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true);
   }
 
   // The connection has ended, with a close code if there was one, or there came none.
@@ -392,6 +397,8 @@ class Session {
     ++counts_.resumptions;
     Handled(handled);
     for (const std::string& each : orders_) outgoing_.push_back({true, each});
+    for (const std::string& door : doors_moved_) Order(message::SetDoor(door, doors_[door]));
+    doors_moved_.clear();
     pose_id_ = std::max(pose_id_, pose_id);
     for (auto& [id, emitter] : emitters_) {
       emitter.moved = true;
@@ -411,6 +418,9 @@ class Session {
     orders_.clear();
     ordered_ = 0;
     pose_id_ = 0;
+    // Not in the hello: a door that the scene lacks would end the stream.
+    for (const auto& [door, openness] : doors_) Order(message::SetDoor(door, openness));
+    doors_moved_.clear();
     std::vector<std::string> over;
     for (auto& [id, emitter] : emitters_) {
       if (emitter.is_heard && emitter.PlaysOnce()) {
@@ -524,7 +534,8 @@ class Session {
   bool listener_moved_ = false, is_trying_ = false, was_welcomed_ = false;
   bool is_to_drop_ = false;  // a connection that resumed a stream which cannot go on
   std::map<std::string, Emitter> emitters_;
-  std::map<std::string, double> doors_;
+  std::map<std::string, double> doors_;  // those that the game has moved
+  std::set<std::string> doors_moved_;    // of them, while there was no connection
   std::deque<Outgoing> outgoing_;
   std::deque<std::string> orders_;  // the newest messages that the server counts, and how many there were
   std::uint64_t ordered_ = 0;

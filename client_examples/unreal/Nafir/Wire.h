@@ -6,7 +6,6 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
-#include <map>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -178,22 +177,13 @@ namespace message {
 // The first message. A `sample_rate` of 0 takes the scene's own; without a `level` the server chooses. With `snapshots` a server that has a
 // secret sends the stream's state now and then.
 inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener,
-                         std::string_view level = {}, bool snapshots = false,
-                         const std::map<std::string, double>& doors = {}) {
+                         std::string_view level = {}, bool snapshots = false) {
   std::string text = "{\"type\":\"hello\",\"protocol\":" + std::to_string(kProtocol) + ",\"scene\":" + wire::Quoted(scene) +
                      ",\"block_size\":" + std::to_string(block_size) + ",\"encoding\":\"" + NameOf(encoding) +
                      "\",\"buffer_blocks\":" + std::to_string(buffer_blocks) + ",\"listener\":{" + wire::Numbers(listener) + "}";
   if (sample_rate > 0) text += ",\"sample_rate\":" + std::to_string(sample_rate);
   if (!level.empty()) text += ",\"level\":" + wire::Quoted(level);
   if (snapshots) text += ",\"snapshots\":true";
-  if (!doors.empty()) {
-    const char* between = ",\"doors\":{";
-    for (const auto& [door, openness] : doors) {
-      text += between + wire::Quoted(door) + ":" + wire::Number(openness);
-      between = ",";
-    }
-    text += "}";
-  }
   return text + "}";
 }
 
