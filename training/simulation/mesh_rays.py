@@ -8,9 +8,9 @@ through is part of it: the share of the mass law, and no more than a wall absorb
 once, as it does for the direct sound: from the face at which it is entered to the back of the next surface. It lets
 through what the more reluctant of its two sides does, which is the same from both.
 
-Of all walls that a ray meets, one is drawn, by the square root of the energy that would go through; there a second ray
-goes on, for all those that might have. Of every two of these, one is followed to a further wall. So there are at most
-two rays more for each on average, however many walls there are, and no energy is lost.
+Of all walls that a ray meets, four are drawn, by the square root of the energy that would go through. There new rays go
+on, for all those that might have. For each of them one further wall is drawn, and behind that one more for every second
+ray. So the work is bounded however many walls there are, and no energy is lost.
 """
 
 import math
@@ -49,7 +49,9 @@ _MARGIN_M = 1e-6
 _MOST_LOOKS = 20_000_000
 # What reaches into the space between a triangle and a receiver by less than this does not.
 _TOUCH_M = 1e-9
-# The share of rays behind a wall that are followed through a further one.
+# At so many of the walls that a ray meets, new rays go on; each of these goes on through one wall more.
+_DRAWN = 4
+# Of the rays behind two walls, this share goes on through a third one, and so on.
 _FOLLOWED = 0.5
 # The most faces that are told apart in one place.
 _MOST_TOGETHER = 16
@@ -75,6 +77,23 @@ class _Receivers(NamedTuple):
     radii: _Floats
     nearest: _Integers
     is_open: npt.NDArray[np.bool_]
+
+
+class _AtWalls(NamedTuple):
+    """Rays that are to go on through walls, one in each row: where they met them, at which row of the tree and whether
+    at its face, and what was of them until then. `scales` are as many of the emitter's rays as each stands for."""
+
+    positions: _Floats
+    directions: _Floats
+    rows: _Integers
+    faces: npt.NDArray[np.bool_]
+    travelled_m: _Floats
+    kept: _Floats
+    chance: _Floats
+    scales: _Floats
+    reflections: _Integers
+    was_scattered: npt.NDArray[np.bool_]
+    walls: _Integers
 
 
 class MeshRayTracer:
@@ -159,8 +178,20 @@ def _trace(
     end_m = histogram.energy.shape[1] * histogram.bin_m
     stack = np.empty(STACK, np.int32)
     blockers = np.full(len(receivers.positions), -1, np.int32)
-    kept, chance, weight = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
-    drawn_kept, drawn_chance, through = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
+    kept, chance, weight, through = np.empty(BANDS), np.empty(BANDS), np.empty(BANDS), np.empty(BANDS)
+    at = _AtWalls(
+        np.empty((_DRAWN, 3)),
+        np.empty((_DRAWN, 3)),
+        np.empty(_DRAWN, np.int32),
+        np.empty(_DRAWN, np.bool_),
+        np.empty(_DRAWN),
+        np.empty((_DRAWN, BANDS)),
+        np.empty((_DRAWN, BANDS)),
+        np.empty(_DRAWN),
+        np.empty(_DRAWN, np.int32),
+        np.empty(_DRAWN, np.bool_),
+        np.empty(_DRAWN, np.int32),
+    )
     for ray in range(rays):
         px, py, pz = emitter[0], emitter[1], emitter[2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
@@ -170,18 +201,17 @@ def _trace(
         weight[:] = scale
         share, travelled_m, reflections, plane = 1.0, 0.0, 0, -1  # the share of such rays that is still followed
         was_scattered, is_mirrored = False, True  # at any reflection so far; at the last one
-        went_through, is_through = False, False  # at any wall so far; after the last reflection
-        while True:
-            # Of the walls that the ray meets, the one through which it is to go on: drawn by its part of `all_drawn`.
-            all_drawn, of_drawn, drawn_share = 0.0, 0.0, 1.0
-            drawn_at, drawn_way, drawn_m = (px, py, pz), (dx, dy, dz), 0.0
-            drawn_row, drawn_face, drawn_reflections, drawn_scattered = -1, True, 0, False
+        walls, is_through = 0, False  # gone through so far; any after the last reflection
+        wait, draws = 0, _DRAWN  # rays that wait to go on through walls; those that this one may add
+        is_on = True
+        while is_on:
+            parts = 0.0  # of all walls that the ray meets, by which those are drawn where new rays go on
             while True:
                 length, row, is_face = closest_hit(tree, stack, px, py, pz, dx, dy, dz, 1e-9, math.inf, plane)
                 length = max(length, 0.0)
                 # Scattered energy reaches receivers as diffuse rain, but not through walls. Image sources account for
                 # the first reflections, and direct paths for what was never reflected.
-                is_late = was_scattered or went_through or reflections > image_order
+                is_late = was_scattered or walls > 0 or reflections > image_order
                 if reflections > 0 and (is_through or (is_mirrored and is_late)):
                     add_crossings(receivers, (px, py, pz), (dx, dy, dz), length, travelled_m, weight, histogram)
                 if row < 0:
@@ -196,14 +226,19 @@ def _trace(
                     for band in range(BANDS):
                         loudest = max(loudest, kept[band] * chance[band] * let[surface, band])
                     part = math.sqrt(loudest) / share
-                    all_drawn += part
-                    if part > 0.0 and rng.random() * all_drawn < part:
-                        of_drawn, drawn_share = part, share
-                        drawn_at, drawn_way, drawn_m = (px, py, pz), (dx, dy, dz), travelled_m
-                        drawn_row, drawn_face = row, is_face
-                        drawn_reflections, drawn_scattered = reflections, was_scattered
-                        drawn_kept[:] = kept
-                        drawn_chance[:] = chance
+                    parts += part
+                    if part > 0.0:
+                        for number in range(wait, wait + draws):
+                            if rng.random() * parts < part:
+                                at.positions[number, 0], at.positions[number, 1], at.positions[number, 2] = px, py, pz
+                                at.directions[number, 0], at.directions[number, 1] = dx, dy
+                                at.directions[number, 2] = dz
+                                at.rows[number], at.faces[number], at.travelled_m[number] = row, is_face, travelled_m
+                                at.kept[number] = kept
+                                at.chance[number] = chance
+                                at.scales[number] = scale / (draws * part * share)
+                                at.reflections[number], at.was_scattered[number] = reflections, was_scattered
+                                at.walls[number] = walls
                 reflections += 1
                 side = 1.0 if is_face else -1.0
                 normal = side * place.normals[row, 0], side * place.normals[row, 1], side * place.normals[row, 2]
@@ -230,50 +265,55 @@ def _trace(
                     dx, dy, dz = _scattered_direction(normal, rng.random(), rng.random())
                 else:
                     dx, dy, dz = mirrored_direction((dx, dy, dz), normal)
-            if drawn_row < 0:
-                break
+            is_on = False
             if let is not None:
-                scale *= all_drawn / (of_drawn * drawn_share)
-                if went_through:
-                    if rng.random() >= _FOLLOWED:
-                        break
-                    scale /= _FOLLOWED
-                length, row = _go_through(place, let, stack, drawn_row, drawn_face, drawn_at, drawn_way, through)
-                loudest = 0.0
-                for band in range(BANDS):
-                    kept[band] = drawn_kept[band] * through[band]
-                    chance[band] = drawn_chance[band]
-                    loudest = max(loudest, kept[band] * chance[band])
-                travelled_m = drawn_m + length
-                if loudest <= 0.0 or travelled_m >= end_m:
-                    break
-                # Behind the wall, the ray is as many as it was before: it is thinned anew.
-                scale, share = scale * loudest, 1.0
-                for band in range(BANDS):
-                    kept[band] /= loudest
-                    weight[band] = kept[band] * chance[band] * scale
-                dx, dy, dz = drawn_way
-                px, py, pz = drawn_at[0] + length * dx, drawn_at[1] + length * dy, drawn_at[2] + length * dz
-                plane, reflections, was_scattered = tree.planes[row], drawn_reflections, drawn_scattered
-                went_through, is_through = True, True
+                if parts > 0.0:
+                    for number in range(wait, wait + draws):
+                        at.scales[number] *= parts
+                    wait += draws
+                while wait > 0 and not is_on:
+                    wait -= 1
+                    scale, walls, draws = at.scales[wait], at.walls[wait] + 1, 1
+                    if walls > 2:
+                        if rng.random() >= _FOLLOWED:
+                            continue
+                        scale /= _FOLLOWED
+                    length, row = _go_through(place, let, stack, at, wait, through)
+                    loudest = 0.0
+                    for band in range(BANDS):
+                        kept[band] = at.kept[wait, band] * through[band]
+                        chance[band] = at.chance[wait, band]
+                        loudest = max(loudest, kept[band] * chance[band])
+                    travelled_m = at.travelled_m[wait] + length
+                    is_on = loudest > 0.0 and travelled_m < end_m
+                    if is_on:
+                        # Behind the wall, the ray is thinned anew, from as many as it stands for.
+                        scale, share = scale * loudest, 1.0
+                        for band in range(BANDS):
+                            kept[band] /= loudest
+                            weight[band] = kept[band] * chance[band] * scale
+                        dx, dy, dz = at.directions[wait, 0], at.directions[wait, 1], at.directions[wait, 2]
+                        px = at.positions[wait, 0] + length * dx
+                        py = at.positions[wait, 1] + length * dy
+                        pz = at.positions[wait, 2] + length * dz
+                        plane, reflections, was_scattered = (
+                            tree.planes[row],
+                            at.reflections[wait],
+                            at.was_scattered[wait],
+                        )
+                        is_through = True
 
 
 @compiled_loosely
 def _go_through(
-    place: _Place,
-    let: _Floats,
-    stack: _Integers,
-    row: int,
-    is_face: bool,
-    position: tuple[float, float, float],
-    direction: tuple[float, float, float],
-    through: _Floats,
+    place: _Place, let: _Floats, stack: _Integers, at: _AtWalls, number: int, through: _Floats
 ) -> tuple[float, int]:
-    """Set the share (band,) that goes through a wall which a ray meets at the triangle of a row in the tree. Returns
-    the way inside the wall, and the row of the triangle where the ray leaves it."""
-    tree, surface, plane = place.tree, place.surfaces[row], place.tree.planes[row]
-    px, py, pz = position
-    dx, dy, dz = direction
+    """Set the share (band,) that goes through the wall that a ray meets. Returns the way inside the wall, and the row
+    in the tree of the triangle where the ray leaves it."""
+    tree, row, is_face = place.tree, at.rows[number], at.faces[number]
+    surface, plane = place.surfaces[row], place.tree.planes[row]
+    px, py, pz = at.positions[number, 0], at.positions[number, 1], at.positions[number, 2]
+    dx, dy, dz = at.directions[number, 0], at.directions[number, 1], at.directions[number, 2]
     for band in range(BANDS):
         through[band] = let[surface, band]
     # Coplanar double faces are one sheet. `cross_all` tells faces from backs by the sign.
