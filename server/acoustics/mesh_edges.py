@@ -30,6 +30,7 @@ from server.acoustics.mesh_edges_kernel import (
     find_steps,
     hide_steps,
     look_round,
+    renew_shortest,
 )
 from server.acoustics.mesh_tree import MeshTree
 
@@ -102,7 +103,8 @@ def bends_of(tree: MeshTree) -> Bends:
     out for being too many."""
     spots = _spots(tree, tree.mesh, _SPACING_M)
     steps = _steps(tree, spots)
-    return _bends(spots, steps, _cells(tree, spots.lifted, steps))
+    lengths, before = _shortest(steps)
+    return Bends(*spots, lengths, before, *_cells(tree, spots.lifted, steps))
 
 
 class StillEdges:
@@ -112,6 +114,8 @@ class StillEdges:
     def __init__(self, tree: MeshTree, swept: Sequence[_Floats]) -> None:
         self._spots = _spots(tree, tree.mesh, _SPACING_M)
         self._steps = _steps(tree, self._spots)
+        self._lengths, self._before = _shortest(self._steps)
+        self._order = np.argsort(self._lengths, axis=-1, kind="stable").astype(np.int16)
         self._cells = _cells(tree, self._spots.lifted, self._steps)
         self._near = [_cells_in_sight(tree, self._cells, points) for points in swept]
 
@@ -127,7 +131,9 @@ class StillEdges:
         find_steps(tree.tree, spots.places, spots.lifted, spots.facings, still, steps)
         ends = still + np.cumsum([len(each.places) for each in of_leaves])
         points = [np.arange(end - len(each.places), end) for each, end in zip(of_leaves, ends, strict=True)]
-        return _bends(spots, steps, self._cells.with_points(self._near, points))
+        lengths, before = np.empty_like(steps), np.empty(steps.shape, np.int16)
+        renew_shortest(steps, self._lengths, self._before, self._order, lengths, before)
+        return Bends(*spots, lengths, before, *self._cells.with_points(self._near, points))
 
 
 class _Spots(NamedTuple):
@@ -189,10 +195,11 @@ def _steps(tree: MeshTree, spots: _Spots) -> npt.NDArray[np.float32]:
     return steps
 
 
-def _bends(spots: _Spots, steps: npt.NDArray[np.float32], cells: _Cells) -> Bends:
+def _shortest(steps: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int16]]:
+    """`Bends.lengths` and `before`."""
     lengths, before = np.empty_like(steps), np.empty(steps.shape, np.int16)
     find_shortest(steps, lengths, before)
-    return Bends(*spots, lengths, before, *cells)
+    return lengths, before
 
 
 def _warn(number: int, most: int) -> None:

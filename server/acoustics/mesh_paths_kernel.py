@@ -281,7 +281,7 @@ def _draw(
 ) -> tuple[float, int]:
     """Write where the path from the listener round the points from `first` to `last` bends, drawn taut as far as
     nothing is in its way; return its length and the number of bends. Of a path with more bends than there is room for,
-    only the first and the last are written."""
+    only the first and the last are written. Where a leaf stands in a way of before it moved, there are no bends."""
     count, point = 1, last
     while point != first:
         point = bends.before[first, point]
@@ -316,6 +316,11 @@ def _draw(
     if not is_free:
         for place in range(count):
             spots[place] = bends.places[chain[place]]
+            if place > 0:
+                # As `find_steps` looks: a line to and fro may differ by how it is rounded.
+                one, other = max(chain[place - 1], chain[place]), min(chain[place - 1], chain[place])
+                if not is_clear(tree, stack, bends.lifted[one], bends.lifted[other], MARGIN_M):
+                    return 0.0, 0
         for _ in range(_GUARDED_SWEEPS):
             moved = 0.0
             for place in range(count):
@@ -428,7 +433,12 @@ def find_mesh_paths(
                     screen_db[row, band] = UNHEARD_DB
                 continue
             first = reached[near_of[last]]
-            length_m[row], corners = _draw(tree, stack, bends, listener, emitter, first, last, chain, spots, ends)
+            length, corners = _draw(tree, stack, bends, listener, emitter, first, last, chain, spots, ends)
+            if not corners:
+                for band in range(len(wavelengths_m)):
+                    screen_db[row, band] = UNHEARD_DB
+                continue
+            length_m[row] = length
             excess_m[row] = max(0.0, length_m[row] - straight)
             _aim(arrival[row], listener, spots[0])
             _aim(departure[row], emitter, spots[corners - 1])

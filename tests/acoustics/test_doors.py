@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 
 from server.acoustics.doors import DoorLeaf, LeafMotion, MeshWithDoors
 from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_edges_kernel import find_shortest, renew_shortest
 from server.acoustics.surroundings import MeshSurroundings
 from tests.two_rooms import BEFORE, BEHIND, EAST, SLIDE, SWING, WEST, box, leaf, moving, rooms
 
@@ -93,6 +94,45 @@ def test_sight_is_exact_at_once_and_ways_are_those_of_before(openness):
     assert soon.bends is before.bends
     doors.at((openness,))
     assert doors.soon_at((openness,), before) is doors.at((openness,))
+
+
+def test_nothing_is_heard_by_a_way_of_before_in_which_the_leaf_now_stands():
+    """Through the open door, a path bends at both of its frames; the leaf shuts between them."""
+    doors = moving()
+    open_ = doors.at((1.0,))
+    assert paths(open_, WEST, EAST).screen_db.min() > -40
+    soon = doors.soon_at((0.0,), open_)
+    for listener in [place for place in places(40, 5) if place[0] < 4]:
+        emitters = np.array([place for place in places(60, 6) if place[0] > 4.2])
+        assert paths(soon, listener, emitters).screen_db.max() <= -99
+
+
+@pytest.mark.parametrize("taken", [0.0, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("more", [0, 15])
+def test_ways_are_renewed_as_if_they_were_found_for_the_first_time(taken, more):
+    """Steps between random places that are near each other, of which some are taken away and some new."""
+    rng = np.random.default_rng(7)
+    at = rng.uniform(size=(60 + more, 2))
+    at[5] = at[6]  # a step of no length
+    far = np.linalg.norm(at[:, None] - at, axis=-1)
+    steps = np.where((far < 0.25) & ~np.eye(len(at), dtype=bool), far, np.inf).astype(np.float32)
+    lengths, before = of(steps[:60, :60].copy())
+    gone = np.triu(rng.uniform(size=(60, 60)) < taken)
+    steps[:60, :60][gone | gone.T] = np.inf
+    renewed, last = np.empty_like(steps), np.empty(steps.shape, np.int16)
+    order = np.argsort(lengths, axis=-1, kind="stable").astype(np.int16)
+    renew_shortest(steps, lengths, before, order, renewed, last)
+    assert np.array_equal(renewed, of(steps)[0])
+    for source, point in np.argwhere((last >= 0) & np.isfinite(renewed)):
+        by = last[source, point]
+        assert renewed[source, point] == renewed[source, by] + steps[by, point]
+    assert np.array_equal(last < 0, ~np.isfinite(renewed) | np.eye(len(at), dtype=bool))
+
+
+def of(steps):
+    lengths, before = np.empty_like(steps), np.empty(steps.shape, np.int16)
+    find_shortest(steps, lengths, before)
+    return lengths, before
 
 
 def test_nobody_is_shut_in_by_a_leaf():
