@@ -9,6 +9,7 @@ orientations (B, 4) as quaternions x, y, z, w, or yaws (B,) of level heads; a fi
 """
 
 import copy
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +24,7 @@ from server.acoustics.reflections import FirstEcho
 from server.acoustics.resampling import resampled_length
 from server.acoustics.sound_path import DescribedPaths, SoundPathFinder
 from server.acoustics.spherical_harmonics import harmonic_count
+from server.acoustics.surroundings import Surroundings
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import BundleError, FieldError
 from server.field.any_size_decoder import add_from, resized
@@ -47,6 +49,7 @@ Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 _CHUNK = 32
+_STATES = itertools.count()
 _HEADS_BYTES = 64 * 1024 * 1024
 """Size of what a field of directions keeps prepared for heads. The longest tail that a scene may have fits in."""
 _HEAD_BYTES = 256 * 1024
@@ -112,6 +115,11 @@ class AcousticField:
 
     _order: int | None = None
     """The order of the ambisonic channels that responses have in place of ears."""
+    _at_first: "AcousticField | None" = None
+    """The same field with doors as they are at the beginning, if this one is of another state of them."""
+    _surroundings: Surroundings | None = None
+    _state: bytes = b""
+    """What tells states of doors apart."""
     source: ResponseSource
     """Where this level gets responses: computed for every pose, or taken from nodes that each represent many poses."""
 
@@ -181,6 +189,10 @@ class AcousticField:
             graph = self.graph.through(filters)
             if graph is self.graph:
                 return self
+            if self._at_first is not None:  # which prepares a head once for all states
+                heard = self._at_first.through(filters).within(self.bundle, self._surroundings)
+                self._heard.put(filters, heard, _HEAD_BYTES)
+                return heard
             heard = self._with(graph)
             tail_bytes = 0 if heard._tail is None else heard._tail.nbytes
             self._heard.put(filters, heard, _HEAD_BYTES + tail_bytes)
@@ -200,6 +212,23 @@ class AcousticField:
             other._order = order
             other._bind(BoundedCache(NODE_CACHE_BYTES))
             self._encoded[order] = other
+        return other
+
+    def within(self, bundle: Bundle, surroundings: Surroundings | None = None) -> "AcousticField":
+        """The same field with doors as `bundle` has them, which is of the same scene. The first sound takes its ways
+        through `surroundings`, by default those of the bundle."""
+        other = copy.copy(self)
+        for kept in ("_heard", "_encoded"):
+            vars(other).pop(kept, None)
+        other._at_first = self if self._at_first is None else self._at_first
+        other._state = next(_STATES).to_bytes(8, "little")
+        other._surroundings = bundle.surroundings if surroundings is None else surroundings
+        other.bundle = bundle
+        other.graph = self.graph.within(bundle, other._surroundings)
+        other._paths = other.graph.paths
+        if self._first_echo is not None:
+            other._first_echo = other._surroundings.first_echo()
+        other._bind(BoundedCache(NODE_CACHE_BYTES))
         return other
 
     def _bind(self, cache: NodeCache) -> None:
@@ -399,7 +428,7 @@ class AcousticField:
         return _Told(arrivals, aligned, *self._opening(listeners, emitters, aligned))
 
     def _remembered(self, listeners: Floats, emitters: Floats) -> _Told:
-        keys = [row.tobytes() for row in np.concatenate([listeners, emitters], axis=-1)]
+        keys = [self._state + row.tobytes() for row in np.concatenate([listeners, emitters], axis=-1)]
         known = [self._told.get(key) for key in keys]
         missing = [row for row, told in enumerate(known) if told is None]
         if missing:
@@ -503,7 +532,8 @@ class Silence(AcousticField):
 
     @cached_property
     def _paths(self) -> SoundPathFinder:  # type: ignore[override]
-        return self.bundle.surroundings.sound_paths(self.bundle.manifest.speed_of_sound)
+        surroundings = self.bundle.surroundings if self._surroundings is None else self._surroundings
+        return surroundings.sound_paths(self.bundle.manifest.speed_of_sound)
 
     @property
     def sample_rate(self) -> int:
@@ -517,9 +547,10 @@ class Silence(AcousticField):
     def through(self, filters: HeadFilters) -> "Silence":  # noqa: ARG002  all heads hear the same
         return self
 
-    def within(self, bundle: Bundle) -> "Silence":
-        """The same in another state of its scene's doors."""
-        return Silence(bundle, self.level, self._sample_rate)
+    def within(self, bundle: Bundle, surroundings: Surroundings | None = None) -> "Silence":
+        other = Silence(bundle, self.level, self._sample_rate)
+        other._surroundings = surroundings
+        return other
 
     def impulse_responses(
         self,

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from server.acoustics.doors import Openness
 from server.acoustics.phase import FrozenNoise
+from server.acoustics.surroundings import Surroundings
 from server.core.bounded_cache import BoundedCache
 from server.core.errors import RequestError
 from server.field.field import AcousticField, Silence, frozen_noise
@@ -117,13 +118,17 @@ class FieldsByLevel(Mapping[str, AcousticField]):
             return self
         levels = self._states.get(openness)
         if levels is None:
-            bundle = self.bundle.with_doors(openness)
-            # Fields know nothing of doors: a scene with doors has none.
-            levels = FieldsByLevel(
-                [field.within(bundle) for field in self._fields.values() if isinstance(field, Silence)]
-            )
+            levels = self._within(self.bundle.with_doors(openness))
             self._states.put(openness, levels, 1)
         return levels
+
+    def soon_with_doors(self, openness: Openness, surroundings: Surroundings) -> "FieldsByLevel":
+        """As `with_doors`, while the first sound takes its ways through other surroundings: those of a moment in which
+        a door moves. Nothing of it is kept."""
+        return self._within(self.bundle.with_doors(openness), surroundings)
+
+    def _within(self, bundle: Bundle, surroundings: Surroundings | None = None) -> "FieldsByLevel":
+        return FieldsByLevel([field.within(bundle, surroundings) for field in self._fields.values()])
 
     @property
     def knows_directions(self) -> bool:

@@ -9,11 +9,12 @@ several frames (`CodecParameters.frame_cells`) in place of frames: late sound is
 take most of the time.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ import numpy.typing as npt
 from server.acoustics.cells import Axis
 from server.acoustics.geometry import yaws_of
 from server.acoustics.sound_path import DESCRIPTION, DescribedPaths
+from server.acoustics.surroundings import Surroundings
 from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
 from server.rendering.hrtf import HeadFilters
@@ -33,6 +35,8 @@ INPUTS = {"listener": [3], "emitter": [3], "yaw": []}
 """The inputs of a graph, with their shapes after the batch axis."""
 PATH = "path"
 """The input of graphs that want to be told the shortest path, as DescribedPaths has it."""
+OPENNESS = "openness"
+"""The input of graphs that know doors: how far each of the field's `doors` is open."""
 OUTPUTS = ("log_magnitude", "instantaneous_frequency", "phase_certainty", "interaural_coherence")
 """The outputs of a graph that gives spectrograms."""
 RESPONSE = "impulse_response"
@@ -111,14 +115,17 @@ class FieldGraph:
         self.gives_responses = RESPONSE in outputs and entry.predicts == "ears"
         """Whether the graph gives impulse responses and not spectrograms."""
         inputs = {given.name: given.shape[1:] for given in session.get_inputs()}
-        expected = {**self._inputs, PATH: [DESCRIPTION]}
+        least = {**self._inputs, **({OPENNESS: [len(entry.doors)]} if entry.doors else {})}
+        expected = {**least, PATH: [DESCRIPTION]}
         self._wants = tuple(inputs)
-        if inputs != expected and inputs != self._inputs:
+        if inputs not in (expected, least):
             raise BundleError(
                 self._path, "inputs", f"are {inputs}, expected {expected} after the batch axis, or all but {PATH}"
             )
         self.paths = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
         """Finds the paths of the graph's poses."""
+        self._doors = entry.doors
+        self._openness = _openness_of(bundle, entry.doors)
         if any(outputs.get(output) != _TENSOR for output in self._shapes):
             raise BundleError(self._path, "outputs", f"are {outputs}, expected {self._expected_outputs}")
         self._check_outputs(bundle)
@@ -130,6 +137,13 @@ class FieldGraph:
     def through(self, filters: HeadFilters) -> "FieldGraph":  # noqa: ARG002  its ears are those of the data
         """The same field heard through this head; the field itself if it predicts the ears of one head."""
         return self
+
+    def within(self, bundle: Bundle, surroundings: Surroundings) -> Self:
+        """The same network with the doors of its scene as `bundle` has them, whose surroundings are given."""
+        other = copy.copy(self)
+        other.paths = surroundings.sound_paths(bundle.manifest.speed_of_sound)
+        other._openness = _openness_of(bundle, self._doors)
+        return other
 
     def run(
         self,
@@ -214,4 +228,12 @@ class FieldGraph:
             given["yaw"] = np.remainder(yaws_of(heads) + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi)
         if PATH in self._wants:
             given[PATH] = (paths or self.paths.describe(listeners, emitters)).described
+        if self._doors:
+            given[OPENNESS] = np.tile(self._openness, (len(given["listener"]), 1))
         return given
+
+
+def _openness_of(bundle: Bundle, doors: Sequence[str]) -> Float32:
+    """(1, door) how far these doors are open."""
+    shares = {door.name: door.openness for door in bundle.doors}
+    return np.array([[shares[name] for name in doors]], np.float32)

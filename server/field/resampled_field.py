@@ -12,10 +12,12 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import Vector3
 from server.acoustics.resampling import resample_responses, resampled_length, samples_before
+from server.acoustics.surroundings import Surroundings
 from server.field.field import AcousticField, Float32, Silence
 from server.field.lattice import Neighbourhood, Snapped
 from server.field.response_source import Floats, ResponseSource
 from server.rendering.hrtf import HeadFilters
+from server.scene.bundle import Bundle
 
 _LEAST_S = 0.085
 """The shortest beginning of a response that is asked for alone. A field's gate gives the energy that it takes from the
@@ -50,6 +52,9 @@ class ResampledField(AcousticField):
 
     def encoded(self, order: int) -> AcousticField:
         return self._of(self.resampled.encoded(order))
+
+    def within(self, bundle: Bundle, surroundings: Surroundings | None = None) -> AcousticField:
+        return ResampledField(self.resampled.within(bundle, surroundings), self._sample_rate)
 
     def _of(self, field: AcousticField) -> "ResampledField":
         return self if field is self.resampled else ResampledField(field, self._sample_rate)

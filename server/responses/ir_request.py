@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.doors import Openness
 from server.acoustics.geometry import Pose
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
@@ -44,6 +45,8 @@ class IrRequest:
     direct_sound: DirectSound
     """The direct sound and first reflections that the field's IRs leave out, as this session hears them."""
     channels: int = 2
+    openness: Openness = ()
+    """How far the scene's doors are open in the levels by which it is computed."""
     is_first: bool = False
     """Whether an emitter in the request waits for its first IR to become audible."""
 

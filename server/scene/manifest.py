@@ -32,7 +32,7 @@ from server.acoustics.codec import Codec
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.mesh import MOST_MATERIALS
 from server.acoustics.spherical_harmonics import HIGHEST_ORDER
-from server.scene.door import MOST_DOORS, Door
+from server.scene.door import MOST_DOORS, Door, DoorName
 from server.scene.effects import EffectName
 from server.scene.geometry import Finite, Geometry, Material, Point, Strict
 from server.scene.limits import FEWEST_SAMPLES, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
@@ -181,6 +181,9 @@ class FieldFile(Strict):
 
     ears: the field predicts spectrograms at the ears of one head, or its response. directions: it predicts the power
     that arrives per octave band, and from where, in spherical harmonics up to `order`.
+
+    `doors` are the doors whose openness the network takes, in this order. A field without any knows no doors: what
+    reverberates is then the same in all states, and the way of its first sound is not.
     """
 
     file: FileName
@@ -189,6 +192,14 @@ class FieldFile(Strict):
     codec: CodecParameters | None = None
     predicts: Literal["ears", "directions"] = "ears"
     order: Annotated[int, Field(ge=0, le=HIGHEST_ORDER)] | None = None
+    doors: tuple[DoorName, ...] = ()
+
+    @field_validator("doors")
+    @classmethod
+    def _are_told_once(cls, doors: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(doors)) < len(doors):
+            raise ValueError("one is there twice: name each door once")
+        return doors
 
     @model_validator(mode="after")
     def _has_an_order_if_it_has_directions(self) -> "FieldFile":
@@ -202,6 +213,8 @@ class FieldFile(Strict):
         if self.predicts == "ears":
             document.pop("predicts", None)
             document.pop("order", None)
+        if not self.doors:
+            document.pop("doors", None)
         return document
 
 
@@ -499,11 +512,18 @@ class Manifest(Strict):
                 raise ValueError(
                     f"mesh.doors.{door.name}.mesh: give the leaf a file of its own that is listed in files"
                 )
-        if self.mesh.doors and self.fields:
-            raise ValueError("mesh.doors: fields do not know doors: leave one of them out")
         for level in self.levels:
             if level.reuse is not None:
                 raise ValueError(f"levels.{level.name}.reuse: is for floor plans: leave it out where there is a mesh")
+        return self
+
+    @model_validator(mode="after")
+    def _has_the_doors_that_its_fields_know(self) -> "Manifest":
+        names = [] if self.mesh is None else [door.name for door in self.mesh.doors]
+        for field, entry in self.fields.items():
+            if unknown := [name for name in entry.doors if name not in names]:
+                known = ", ".join(names) or "none"
+                raise ValueError(f"fields.{field}.doors: {unknown[0]!r} is not in mesh.doors, which are {known}")
         return self
 
     @model_validator(mode="after")

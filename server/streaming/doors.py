@@ -43,7 +43,8 @@ class DoorRequest:
         if self.before is None:
             surroundings, levels = self.moving.at(self.openness), self.levels.with_doors(self.openness)
         else:
-            surroundings, levels = self.moving.soon_at(self.openness, self.before), self.levels
+            surroundings = self.moving.soon_at(self.openness, self.before)
+            levels = self.levels.soon_with_doors(self.openness, surroundings)
         direct_sound = self.direct_sound.within(surroundings)
         return DoorsMoved(self.openness, surroundings, direct_sound, levels, self.before)
 

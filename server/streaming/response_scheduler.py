@@ -10,6 +10,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from server.acoustics.doors import Openness
 from server.acoustics.geometry import Pose
 from server.core.errors import RequestError
 from server.field.fields_by_level import FieldsByLevel
@@ -110,7 +111,6 @@ class ResponseScheduler:
         self._direct_sound, self._levels = direct_sound, levels
         for emitter in self._emitters.values():
             emitter.is_outdated = True
-        self._next_request_clock = 0
         self._look_again()
 
     def set_quality(self, quality: QualityStep, reason: LevelReason) -> list[ServerMessage]:
@@ -233,6 +233,7 @@ class ResponseScheduler:
             asked,
             self._direct_sound,
             self._effects.channels,
+            self._levels.bundle.openness,
             is_first=is_first,
         )
 
@@ -249,7 +250,8 @@ class ResponseScheduler:
         kept = {}
         for emitter, state in zip(emitters, states, strict=True):
             whole = emitter.heard.whole
-            circumstances = self._circumstances(self._wanted.level, state, self._effects.channels)
+            openness = self._levels.bundle.openness
+            circumstances = self._circumstances(self._wanted.level, state, self._effects.channels, openness)
             if whole is not None and whole.circumstances == circumstances and not state.effects.bakes_direct:
                 kept[emitter.serial] = whole.ir
                 ages[emitter.serial] = whole.age(listener, state.position, reach_m, THRESHOLDS.late_turn_deg)
@@ -259,9 +261,9 @@ class ResponseScheduler:
         return kept
 
     @staticmethod
-    def _circumstances(level: str, state: EmitterState, channels: int) -> Hashable:
+    def _circumstances(level: str, state: EmitterState, channels: int, openness: Openness) -> Hashable:
         """On what else but poses the later part of an IR depends."""
-        return level, state.effects.early, state.effects.late, state.directivity, channels
+        return level, state.effects.early, state.effects.late, state.directivity, channels, openness
 
     def accept(self, response: IrResponse) -> list[ServerMessage]:
         """Put the answer to the last request into effect, from the next block on."""
@@ -280,7 +282,8 @@ class ResponseScheduler:
                 continue
             ir, asked = arrived[emitter.serial]
             if asked.like is None:
-                circumstances = self._circumstances(response.request.level, asked.state, response.request.channels)
+                request = response.request
+                circumstances = self._circumstances(request.level, asked.state, request.channels, request.openness)
                 where = response.request.listener, asked.state.position
                 emitter.heard.whole = WholeResponse(ir, *where, circumstances)
             if self._effects.accept_ir(identifier, emitter, ir, asked.state.effects, pose_id):

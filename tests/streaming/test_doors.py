@@ -21,7 +21,7 @@ from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from server.streaming.stream_times import StreamTimes
 from tests.signals import error_db
-from tests.two_rooms import BEFORE, BEHIND, EAST, SLIDE, WEST, write_two_rooms
+from tests.two_rooms import BEFORE, BEHIND, EAST, SLIDE, WEST, write_reverberant_rooms, write_two_rooms
 
 RATE, BLOCK = 24_000, 256
 QUALITY = QualityStep("geometry", None, Sharing.NOTHING, 1.0)
@@ -36,10 +36,18 @@ def levels(tmp_path_factory):
     return FieldsByLevel.load(write_two_rooms(tmp_path_factory.mktemp("two-rooms") / "scene"))
 
 
-def opened(levels, *, planned=False, clip=NOISE, **hello):
+@pytest.fixture(scope="module")
+def reverberant(tmp_path_factory):
+    """Their field reverberates as much as the door is open."""
+    return FieldsByLevel.load(write_reverberant_rooms(tmp_path_factory.mktemp("two-rooms") / "scene"))
+
+
+def opened(levels, *, planned=False, clip=NOISE, quality=QUALITY, **hello):
     place = place_of(levels.bundle, ()) if planned else None
     hello = Hello(protocol=PROTOCOL, scene="two-rooms", **hello)
-    return Session(hello, levels, kemar(RATE), lambda _: clip, quality=QUALITY, window=100_000, place=place)
+    quality = replace(quality, level=levels.default.level.name)
+    head, own = kemar(hello.sample_rate or RATE), kemar(RATE)
+    return Session(hello, levels, head, lambda _: clip, quality=quality, window=100_000, place=place, field_filters=own)
 
 
 def answer_doors(session, *, whole=True) -> int:
@@ -125,6 +133,54 @@ def test_a_hello_may_have_doors_open_or_shut_and_nothing_else_is_ever_heard(leve
     heard = hear(session, 60)
     expected = hear(listen(opened(levels.with_doors((0.0,)))), 60)
     assert_allclose(heard, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["in a moment", "with all ways"])
+@pytest.mark.parametrize("rate", [RATE, 48_000])
+def test_reverberation_is_that_of_the_door_as_it_is(reverberant, whole, rate):
+    """Also before the ways round edges are known: the listener sees the emitter past the door."""
+    levels, place = reverberant.at_rate(rate), (3.5, 1.0, 1.5)
+    moved = listen(opened(reverberant, sample_rate=rate), WEST, place)
+    hear(moved, 20)
+    set_door(moved, 0.5)
+    answer_doors(moved, whole=whole)
+    answer(moved)
+    assert moved.levels.bundle.openness == (0.5,)
+    still, shut = (listen(opened(levels.with_doors((share,)), sample_rate=rate), WEST, place) for share in (0.5, 0.0))
+    hear(still, 20), hear(shut, 20)
+    heard, expected, other = (hear(each, 80)[:, 40 * BLOCK :] for each in (moved, still, shut))
+    assert error_db(heard, expected) < -40
+    assert error_db(other, expected) > -30
+
+
+def test_no_late_part_of_another_state_is_kept(reverberant):
+    """Nor one that was asked for before the door moved, and came after."""
+    session = listen(opened(reverberant, quality=replace(QUALITY, late_reach_m=2.0)), WEST, EAST)
+    session.receive(ListenerPose(pose_id=2, position=(1.6, 1.0, 1.5), yaw=0.0))
+    late = session.take_request()
+    assert late.openness == (1.0,)
+    assert late.asked[0].like is not None
+    set_door(session, 0.0)
+    answer_doors(session)
+    session.accept(compute_irs(reverberant, late, session.renderer))
+    request = session.take_request()
+    assert request.openness == (0.0,)
+    assert request.asked[0].like is None
+
+
+def test_a_door_that_moves_asks_no_more_often_than_a_pose(levels):
+    """So that it cannot upset what a busy server has left for each stream."""
+    session = listen(opened(levels))
+    session.set_ir_interval(1.0)
+    session.receive(ListenerPose(pose_id=2, position=(2.6, 2.45, 1.5), yaw=0.0))
+    answer(session)
+    asked = 0
+    for block in range(40):  # 0.43 s
+        set_door(session, block / 40)
+        answer_doors(session)
+        asked += session.take_request() is not None
+        session.render_block()
+    assert asked == 0
 
 
 @pytest.mark.parametrize("planned", [False, True])
