@@ -8,7 +8,7 @@ more, which is work for another thread.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from threading import Lock
 from typing import Literal
 
@@ -25,8 +25,8 @@ from server.core.bounded_cache import BoundedCache
 _Floats = npt.NDArray[np.float64]
 Openness = tuple[float, ...]
 """Of each door, from 0 to 1."""
-_KEPT_STATES = 8
-"""Ways round the edges of a house take four megabytes in each."""
+_KEPT_BYTES, _KEPT_SOON = 32 * 1024 * 1024, 8
+"""Of states, some five megabytes each for a house, and how many of those that are for a moment only."""
 _WAYS_OF_A_SWING = np.linspace(0.0, 1.0, 5)
 _SHRUNK = 0.9
 """Leaves touch their frames; points on this share of them do not."""
@@ -91,7 +91,8 @@ class MeshWithDoors:
         self.leaves = tuple(leaves)
         self.materials = TriangleMesh.joined([still, *(leaf.mesh for leaf in leaves)]).materials
         self._open_sky = open_sky
-        self._kept: BoundedCache[Openness, MeshSurroundings] = BoundedCache(_KEPT_STATES)
+        self._kept: BoundedCache[Openness, MeshSurroundings] = BoundedCache(_KEPT_BYTES)
+        self._kept_soon: BoundedCache[tuple[Openness, MeshSurroundings], MeshSurroundings] = BoundedCache(_KEPT_SOON)
         self._finding = Lock()
 
     @cached_property
@@ -101,7 +102,7 @@ class MeshWithDoors:
 
     @cached_property
     def _edges(self) -> StillEdges:
-        return StillEdges(self.tree, [leaf.swept() for leaf in self.leaves])
+        return StillEdges(self.tree, [leaf.mesh for leaf in self.leaves], [leaf.swept() for leaf in self.leaves])
 
     def holds(self, position: Vector3) -> bool:
         """Whether a point is in the air, wherever the leaves are."""
@@ -109,8 +110,7 @@ class MeshWithDoors:
 
     def mesh_at(self, openness: Openness) -> TriangleMesh:
         """All surfaces, with the leaves where they are."""
-        leaves = [leaf.at(of_door) for leaf, of_door in zip(self.leaves, openness, strict=True)]
-        return TriangleMesh.joined([self.still, *leaves])
+        return TriangleMesh.joined([self.still, *self._leaves_at(openness)])
 
     def at(self, openness: Openness) -> MeshSurroundings:
         """The surroundings in a state, of which the last few are kept."""
@@ -118,15 +118,26 @@ class MeshWithDoors:
             found = self._kept.get(openness)
             if found is None:
                 tree = MeshTree(self.mesh_at(openness))
-                found = self._surroundings(tree, self._edges.bends_among(tree, self._leaves_at(openness)))
-                self._kept.put(openness, found, 1)
+                moves = [
+                    partial(leaf.motion.moved, openness=share)
+                    for leaf, share in zip(self.leaves, openness, strict=True)
+                ]
+                bends = self._edges.bends_among(tree, self._leaves_at(openness), moves)
+                found = self._surroundings(tree, bends)
+                self._kept.put(openness, found, sum(part.nbytes for part in (*bends, *tree.tree)))
             return found
 
     def soon_at(self, openness: Openness, before: MeshSurroundings) -> MeshSurroundings:
         """The surroundings in a state but for the ways round edges: these are as in the state `before`. Who sees whom
-        is exact, so that nothing is heard straight through a leaf. This takes a few milliseconds."""
-        kept = self._kept.get(openness)
-        return kept or self._surroundings(MeshTree(self.mesh_at(openness)), before.bends)
+        is exact, so that nothing is heard straight through a leaf. This takes a few milliseconds. The last few are
+        kept, since all listeners of a stream ask for the same."""
+        if (kept := self._kept.get(openness)) is not None:
+            return kept
+        found = self._kept_soon.get((openness, before))
+        if found is None:
+            found = self._surroundings(MeshTree(self.mesh_at(openness)), before.bends)
+            self._kept_soon.put((openness, before), found, 1)
+        return found
 
     def _surroundings(self, tree: MeshTree, bends: Bends) -> MeshSurroundings:
         return MeshSurroundings(tree.mesh, open_sky=self._open_sky, tree=tree, bends=bends, still=self.tree)

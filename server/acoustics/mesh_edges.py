@@ -15,7 +15,7 @@ import heapq
 import itertools
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +44,8 @@ _SPACING_M = 0.25
 """How far points on an edge are apart at most, unless there would be too many."""
 _LEAF_SPACING_M = 0.5
 """The same on leaves of doors, whose points are found anew whenever they move."""
+_MOST_LEAF_EDGES, _MOST_LEAF_POINTS = 64, 48
+"""The most edges of a leaf round which sound bends, the longest and sharpest, and the most points on them."""
 _COARSER = 1.1
 _MOST_LOOKED_ROUND = 16_384
 """The most places on edges around which it is looked, some 70 microseconds each."""
@@ -101,29 +103,36 @@ class Bends(NamedTuple):
 def bends_of(tree: MeshTree) -> Bends:
     """Find the points of a mesh, at most `MOST_POINTS`, and the ways between them. Logs a warning if edges are left
     out for being too many."""
-    spots = _spots(tree, tree.mesh, _SPACING_M)
+    spots = _spots(tree, _edges(tree.mesh), _SPACING_M)
     steps = _steps(tree, spots)
     lengths, before = _shortest(steps)
     return Bends(*spots, lengths, before, *_cells(tree, spots.lifted, steps))
 
 
 class StillEdges:
-    """The edges of a mesh in which leaves of doors move. What the mesh alone decides is found once; `swept`, for each
-    leaf, are points (n, 3) on it all along its way."""
+    """The edges of a mesh in which `leaves` of doors move, which are given shut. What does not depend on where they are
+    is found once; `swept`, for each leaf, are points (n, 3) on it all along its way."""
 
-    def __init__(self, tree: MeshTree, swept: Sequence[_Floats]) -> None:
-        self._spots = _spots(tree, tree.mesh, _SPACING_M)
+    def __init__(self, tree: MeshTree, leaves: Sequence[TriangleMesh], swept: Sequence[_Floats]) -> None:
+        self._of_leaves = [_edges(leaf).longest(_MOST_LEAF_EDGES) for leaf in leaves]
+        self._spots = _spots(tree, _edges(tree.mesh), _SPACING_M)
         self._steps = _steps(tree, self._spots)
         self._lengths, self._before = _shortest(self._steps)
         self._order = np.argsort(self._lengths, axis=-1, kind="stable").astype(np.int16)
         self._cells = _cells(tree, self._spots.lifted, self._steps)
         self._near = [_cells_in_sight(tree, self._cells, points) for points in swept]
 
-    def bends_among(self, tree: MeshTree, leaves: Sequence[TriangleMesh]) -> Bends:
-        """The points, and the ways between them, with the `leaves` where they are in `tree`. Points on their edges are
-        added, and ways that they stand in are taken away."""
+    def bends_among(
+        self, tree: MeshTree, leaves: Sequence[TriangleMesh], moves: Sequence[Callable[[_Floats], _Floats]]
+    ) -> Bends:
+        """The points, and the ways between them, with the `leaves` where they are in `tree`: `moves` are how points
+        (n, 3) of each have moved since it was shut. Points on their edges are added, and ways that they stand in are
+        taken away."""
         still = len(self._spots.places)
-        of_leaves = [_spots(tree, leaf, _LEAF_SPACING_M) for leaf in leaves]
+        of_leaves = [
+            _spots(tree, edges.moved(move), _LEAF_SPACING_M, _MOST_LEAF_POINTS)
+            for edges, move in zip(self._of_leaves, moves, strict=True)
+        ]
         spots = _Spots(*(np.concatenate(parts) for parts in zip(self._spots, *of_leaves, strict=True)))
         steps = np.full((len(spots.places), len(spots.places)), np.inf, np.float32)
         steps[:still, :still] = self._steps
@@ -168,18 +177,19 @@ class _Cells(NamedTuple):
         return self._replace(begins=begins.astype(np.int64), seen=np.concatenate(lists).astype(np.int32))
 
 
-def _spots(tree: MeshTree, mesh: TriangleMesh, spacing_m: float) -> _Spots:
-    """The points on edges of `mesh`, which is in `tree`, or part of what is."""
-    edges = _edges(mesh)
+def _spots(tree: MeshTree, edges: "_Edges", spacing_m: float, most: int = MOST_POINTS) -> _Spots:
+    """At most so many points on edges of the mesh of `tree`, or of a part of it."""
     points = _points(tree, edges, spacing_m)
     runs = _runs(points)
     kept = np.arange(len(runs.first))
     if len(kept) > MOST_POINTS:
         kept = _most_useful(tree, points, runs)
         _warn(len(runs.first), MOST_POINTS)
+    if len(kept) > most:  # of a leaf
+        kept = np.sort(np.argsort(-runs.counts * runs.spacings, kind="stable")[:most])
     runs = runs.only(kept)
     low, high = _reach(tree, edges, points, runs)
-    chosen, run, portions = _spread(runs, spacing_m)
+    chosen, run, portions = _spread(runs, spacing_m, most)
     points = points.only(chosen)
     # At its very end, an edge touches what it ends at, which would be in the way.
     low, high = np.minimum(low[run] + _INSET_M, points.at), np.maximum(high[run] - _INSET_M, points.at)
@@ -216,6 +226,15 @@ class _Edges(NamedTuple):
     alongs: _Floats
     extents: _Floats
     aside: _Floats
+
+    def longest(self, most: int) -> "_Edges":
+        return _Edges(*(each[:most] for each in self))
+
+    def moved(self, move: Callable[[_Floats], _Floats]) -> "_Edges":
+        """The same where a rigid motion of points (n, 3) takes them."""
+        starts = move(self.starts)
+        alongs, aside = (np.ascontiguousarray(move(self.starts + way) - starts) for way in (self.alongs, self.aside))
+        return _Edges(np.ascontiguousarray(starts), alongs, self.extents, aside)
 
 
 class _Points(NamedTuple):
@@ -269,12 +288,12 @@ def _runs(points: _Points) -> _Runs:
     return _Runs(first, last, points.portions[first])
 
 
-def _spread(runs: _Runs, spacing_m: float) -> tuple[_Integers, _Integers, _Floats]:
-    """At most `MOST_POINTS` points, spread evenly over at most as many stretches: their numbers, those of their
+def _spread(runs: _Runs, spacing_m: float, most: int) -> tuple[_Integers, _Integers, _Floats]:
+    """At most so many points, spread evenly over at most as many stretches: their numbers, those of their
     stretches, and for how much of an edge each stands, in metres."""
     counts, extents = runs.counts, runs.counts * runs.spacings
     numbers = counts
-    while numbers.sum() > MOST_POINTS:
+    while numbers.sum() > most:
         spacing_m *= _COARSER
         numbers = np.minimum(counts, np.ceil(extents / spacing_m).astype(np.int64))
     run = np.repeat(np.arange(len(counts)), numbers)

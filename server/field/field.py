@@ -136,13 +136,9 @@ class AcousticField:
         self.graph = graph
         if level.order is not None and isinstance(graph, DirectionalGraph):
             self.graph = graph = graph.of_order(level.order)
-        self._paths = graph.paths
         is_whole = bundle.manifest.direct_sound == "field"
         # Measured sound may arrive earlier than geometry predicts: the gate opens with the first coded sample.
         self._lead = 0 if is_whole else graph.parameters.lead_samples
-        self._first_echo: FirstEcho | None = None
-        if not is_whole and not graph.gives_responses:
-            self._first_echo = bundle.surroundings.first_echo()
         self._gate = Gate(
             graph.parameters,
             rise_s=_RISE_AFTER_FIRST_S if self._first_echo and bundle.manifest.image_order else RISE_S,
@@ -216,19 +212,16 @@ class AcousticField:
 
     def within(self, bundle: Bundle, surroundings: Surroundings | None = None) -> "AcousticField":
         """The same field with doors as `bundle` has them, which is of the same scene. The first sound takes its ways
-        through `surroundings`, by default those of the bundle."""
+        through `surroundings`, by default those of the bundle. What takes long is done when it is first needed."""
         other = copy.copy(self)
-        for kept in ("_heard", "_encoded"):
+        for kept in ("_heard", "_encoded", "_paths", "_first_echo"):
             vars(other).pop(kept, None)
         other._at_first = self if self._at_first is None else self._at_first
         other._state = next(_STATES).to_bytes(8, "little")
-        other._surroundings = bundle.surroundings if surroundings is None else surroundings
-        other.bundle = bundle
-        other.graph = self.graph.within(bundle, other._surroundings)
-        other._paths = other.graph.paths
-        if self._first_echo is not None:
-            other._first_echo = other._surroundings.first_echo()
-        other._bind(BoundedCache(NODE_CACHE_BYTES))
+        other.bundle, other._surroundings = bundle, surroundings
+        other.graph = self.graph.within(bundle, surroundings)
+        # Levels that reuse responses are for floor plans, which have no doors.
+        other.source = ComputedResponses(other._compute_all)
         return other
 
     def _bind(self, cache: NodeCache) -> None:
@@ -250,6 +243,16 @@ class AcousticField:
         if self.level.tail == "stft" or not isinstance(self.graph, DirectionalGraph):
             return None
         return BandTail(self.graph, self.bundle.frozen_noise)
+
+    @cached_property
+    def _paths(self) -> SoundPathFinder:
+        return self.graph.paths
+
+    @cached_property
+    def _first_echo(self) -> FirstEcho | None:
+        if self.bundle.manifest.direct_sound == "field" or self.graph.gives_responses:
+            return None
+        return (self._surroundings or self.bundle.surroundings).first_echo()
 
     @cached_property
     def _encoded(self) -> dict[int, "AcousticField"]:
@@ -531,9 +534,8 @@ class Silence(AcousticField):
         self.source = ComputedResponses(self.impulse_responses)
 
     @cached_property
-    def _paths(self) -> SoundPathFinder:  # type: ignore[override]
-        surroundings = self.bundle.surroundings if self._surroundings is None else self._surroundings
-        return surroundings.sound_paths(self.bundle.manifest.speed_of_sound)
+    def _paths(self) -> SoundPathFinder:
+        return (self._surroundings or self.bundle.surroundings).sound_paths(self.bundle.manifest.speed_of_sound)
 
     @property
     def sample_rate(self) -> int:

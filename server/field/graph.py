@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from server.acoustics.cells import Axis
 from server.acoustics.geometry import yaws_of
-from server.acoustics.sound_path import DESCRIPTION, DescribedPaths
+from server.acoustics.sound_path import DESCRIPTION, DescribedPaths, SoundPathFinder
 from server.acoustics.surroundings import Surroundings
 from server.core.errors import BundleError
 from server.field.runtime import SESSION_ERRORS, InferenceSession, open_session
@@ -122,8 +122,8 @@ class FieldGraph:
             raise BundleError(
                 self._path, "inputs", f"are {inputs}, expected {expected} after the batch axis, or all but {PATH}"
             )
-        self.paths = bundle.surroundings.sound_paths(bundle.manifest.speed_of_sound)
-        """Finds the paths of the graph's poses."""
+        self._bundle = bundle
+        self._surroundings: Surroundings | None = None
         self._doors = entry.doors
         self._openness = _openness_of(bundle, entry.doors)
         if any(outputs.get(output) != _TENSOR for output in self._shapes):
@@ -138,10 +138,17 @@ class FieldGraph:
         """The same field heard through this head; the field itself if it predicts the ears of one head."""
         return self
 
-    def within(self, bundle: Bundle, surroundings: Surroundings) -> Self:
-        """The same network with the doors of its scene as `bundle` has them, whose surroundings are given."""
+    @cached_property
+    def paths(self) -> SoundPathFinder:
+        """Finds the paths of the graph's poses."""
+        return (self._surroundings or self._bundle.surroundings).sound_paths(self._bundle.manifest.speed_of_sound)
+
+    def within(self, bundle: Bundle, surroundings: Surroundings | None) -> Self:
+        """The same network with the doors of its scene as `bundle` has them, and in its surroundings if none are
+        given."""
         other = copy.copy(self)
-        other.paths = surroundings.sound_paths(bundle.manifest.speed_of_sound)
+        vars(other).pop("paths", None)
+        other._bundle, other._surroundings = bundle, surroundings
         other._openness = _openness_of(bundle, self._doors)
         return other
 

@@ -44,7 +44,6 @@ class ResampledField(AcousticField):
         self.resampled = field
         """The field at its own rate."""
         self._sample_rate = sample_rate
-        self._paths = field.paths
         self.source = _ResampledSource(field.source, field.sample_rate, sample_rate)
 
     def through(self, filters: HeadFilters) -> AcousticField:

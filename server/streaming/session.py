@@ -73,6 +73,7 @@ from server.streaming.response_scheduler import ResponseScheduler, Scope
 
 STOP_FADE_S = 0.01
 """The fade of a clip at its `stop_at`."""
+_MOST_DOOR_INTERVAL_S = 0.1
 
 
 def _start_pose(bundle: Bundle) -> Pose:
@@ -170,6 +171,7 @@ class Session:
             quality=quality,
         )
         self._doors: FollowedDoors | None = None
+        self._door_interval_s, self._next_door_clock = 0.0, 0
         if self._bundle.moving is not None:
             self._doors = FollowedDoors(self._bundle.moving, levels, self._direct_sound, hello.doors)
         else:
@@ -218,8 +220,10 @@ class Session:
         return self._responses.set_quality(quality, reason)
 
     def set_ir_interval(self, interval_s: float) -> None:
-        """Set the least time between requests for IRs; an emitter that waits for its first IR is not affected."""
+        """Set the least time between requests for IRs; an emitter that waits for its first IR is not affected. Doors
+        are followed as often, and never more seldom than ten times a second."""
         self._responses.space(interval_s)
+        self._door_interval_s = min(interval_s, _MOST_DOOR_INTERVAL_S)
 
     def space_plans(self, interval_s: float) -> None:
         """Set the least time between plans of effects; changes that need a plan at once are not affected."""
@@ -304,7 +308,13 @@ class Session:
 
     def take_door_requests(self) -> list[DoorRequest]:
         """Return the states of doors to prepare now."""
-        return [] if self._doors is None else self._doors.take_requests()
+        if self._doors is None or self.sample_clock < self._next_door_clock:
+            return []
+        requests = self._doors.take_requests()
+        if requests:
+            rate_hz = self._responses.levels.default.sample_rate
+            self._next_door_clock = self.sample_clock + round(self._door_interval_s * rate_hz)
+        return requests
 
     def adopt_doors(self, moved: DoorsMoved) -> None:
         """Hear with doors as they were prepared, from the next block on: straight and bent sound at once, mirrored

@@ -172,6 +172,32 @@ def test_a_ray_along_an_edge_and_coplanar_double_faces_stay_shut():
     assert paths(shut, WEST, EAST).screen_db.max() <= -99
 
 
+def test_an_ornate_leaf_costs_little_more_than_a_plain_one():
+    """Of its many edges, the longest bend sound: those of the leaf itself."""
+    rng = np.random.default_rng(0)
+    knobs = [
+        box((4.03, y, z), (4.05, y + 0.08, z + 0.08), "wood") for y, z in rng.uniform((2.05, 0.1), (2.8, 2.6), (60, 2))
+    ]
+    still = MeshSurroundings(rooms().mesh).bends.places
+    doors = MeshWithDoors(rooms().mesh, [DoorLeaf(TriangleMesh.joined([leaf(), *knobs]), SWING)])
+    state = doors.at((0.5,))
+    assert len(state.bends.places) <= len(still) + 48
+    free = SWING.moved(np.array([(4.05, 2.9, 1.4)]), 0.5)  # half way up the edge that is not at the hinge
+    assert np.linalg.norm(state.bends.places - free, axis=-1).min() < 0.5
+    plain = moving().at((0.5,))
+    ours, theirs = (paths(each, WEST, EAST).length_m[0] for each in (state, plain))
+    assert ours == pytest.approx(theirs, abs=0.1)
+
+
+def test_all_listeners_of_a_stream_have_the_same_moment():
+    doors = moving()
+    before = doors.at((1.0,))
+    assert doors.soon_at((0.5,), before) is doors.soon_at((0.5,), before)
+    assert doors.soon_at((0.5,), before) is not doors.soon_at((0.4,), before)
+    other = doors.at((0.9,))
+    assert doors.soon_at((0.5,), other).bends is other.bends
+
+
 def test_leaves_without_an_edge_that_bends_are_taken():
     """A leaf within a wall, where no sound gets round it."""
     buried = LeafMotion("slide", (0.0, 0.0, 0.0), 0.0, (0.0, 0.5, 0.0))

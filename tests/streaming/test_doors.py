@@ -183,6 +183,23 @@ def test_a_door_that_moves_asks_no_more_often_than_a_pose(levels):
     assert asked == 0
 
 
+def test_on_a_busy_server_doors_are_followed_ten_times_a_second(levels):
+    """However fast they are moved, and to the end."""
+    session = listen(opened(levels))
+    session.set_ir_interval(1.0)
+    asked = []
+    for block in range(90):  # 0.96 s
+        set_door(session, min(1.0, block / 80))
+        for request in session.take_door_requests():
+            asked.append(request.before)
+            session.adopt_doors(request.prepare())
+        session.render_block()
+    assert 9 <= sum(before is not None for before in asked) <= 11
+    hear(session, 12)
+    answer_doors(session)
+    assert session.levels.bundle.openness == (1.0,)
+
+
 @pytest.mark.parametrize("planned", [False, True])
 def test_a_snapshot_keeps_the_doors(levels, planned):
     session = listen(opened(levels, planned=planned))
