@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from server.acoustics.doors import LeafMotion
+from server.acoustics.doors import DoorLeaf, LeafMotion
+from server.acoustics.mesh import TriangleMesh
 from server.api.catalogue import describe_scene
 from server.core.errors import BundleError, RequestError
 from server.field.fields_by_level import FieldsByLevel
@@ -14,7 +15,20 @@ from server.responses.impulse_response import ImpulseResponse, IrQuery, entity_t
 from server.scene.bundle import write_bundle
 from server.scene.door import read_openness
 from server.scene.manifest import Manifest
-from tests.two_rooms import EAST, SLIDE, WEST, box, document, door, leaf, rooms, write_two_rooms
+from tests.two_rooms import (
+    BEFORE,
+    BEHIND,
+    EAST,
+    SLIDE,
+    SWING,
+    WEST,
+    box,
+    document,
+    door,
+    leaf,
+    rooms,
+    write_two_rooms,
+)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +137,31 @@ def test_responses_are_those_of_a_state_and_so_are_their_tags(bundle):
     assert len(tags) == 6
     assert levels.with_doors((0.3,)) is levels.with_doors((0.3,))
     assert levels.with_doors((1.0,)) is levels
+
+
+@pytest.mark.parametrize("openness", [0.0, 0.35, 1.0])
+@pytest.mark.parametrize("motion", [SWING, SLIDE], ids=["swing", "slide"])
+def test_a_state_sounds_as_a_mesh_with_the_leaf_in_it(tmp_path, motion, openness):
+    """Where sound goes straight, it does to the sample, with all that the leaf mirrors and lets through. Where it
+    bends, the points at which it may do so are others."""
+    states = write_two_rooms(tmp_path / "doors", motion).with_doors((openness,))
+    given = document([], id="still")
+    mesh = TriangleMesh.joined([rooms().mesh, DoorLeaf(leaf(), motion).at(openness)])
+    still = write_bundle(tmp_path / "still", Manifest.model_validate(given), {"geometry.npz": mesh.to_bytes()})
+    fields = [FieldsByLevel.load(each).default for each in (states, still)]
+    straight = 0
+    for listener in (WEST, BEFORE, (3.5, 1.0, 1.5), (3.7, 2.2, 0.4)):
+        for emitter in (BEFORE, BEHIND, EAST, (2.0, 4.0, 0.8)):
+            ours, theirs = (
+                ImpulseResponse.compute(field, IrQuery.checked(field, listener, emitter)).samples for field in fields
+            )
+            path = states.surroundings.sound_paths(343.0).find(listener, [emitter])
+            if path.in_sight[0] and path.screen_db.min() == 0:  # no edge is near its way
+                assert np.array_equal(ours, theirs)
+                straight += 1
+            level = 10 * np.log10(np.sum(ours.astype(float) ** 2) / np.sum(theirs.astype(float) ** 2))
+            assert abs(level) < 0.3
+    assert straight >= 3
 
 
 def test_a_door_is_described_as_one_draws_it(bundle):

@@ -235,9 +235,10 @@ def test_a_door_that_there_is_not_is_refused_and_the_stream_goes_on(levels, fiel
 
 
 @pytest.mark.parametrize("hurried", [True, False])
-def test_a_door_that_is_slammed_makes_no_click(levels, hurried):
+@pytest.mark.parametrize("place", ["levels", "reverberant"])
+def test_a_door_that_is_slammed_makes_no_click(request, place, hurried):
     """What is one tone stays one, to -90 dB above 4 kHz."""
-    session = listen(opened(levels, clip=TONE))
+    session = listen(opened(request.getfixturevalue(place), clip=TONE))
     hear(session, 60)
     parts = [hear(session, 10)]
     for openness in (0.0, 1.0, 0.4, 0.0, 1.0):
@@ -249,7 +250,7 @@ def test_a_door_that_is_slammed_makes_no_click(levels, hurried):
     power = np.abs(np.fft.rfft(heard * np.kaiser(heard.shape[1], 20))) ** 2
     high = np.fft.rfftfreq(heard.shape[1], 1 / RATE) > 4_000
     assert 10 * np.log10(power[:, high].sum() / power.sum()) < -90
-    assert level_db(parts[1][:, 6 * BLOCK :]) < level_db(parts[0]) - 15
+    assert level_db(parts[1][:, 6 * BLOCK :]) < level_db(parts[0]) - 12
 
 
 def test_doors_that_move_every_block_are_followed(levels):
