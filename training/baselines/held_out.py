@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.doors import Openness
 from server.acoustics.geometry import Quaternion
 from server.core.errors import NafirError
 from server.rendering.hrtf import HeadFilters, Hrtf, kemar
@@ -61,6 +62,13 @@ class HeldOut:
     """Number of pairs that are not used because they lack a response at one of the orientations."""
     filters: HeadFilters | None = None
     """The head through which the responses are heard, if it is not that of the data."""
+
+    def openness(self, index: int) -> Openness | None:
+        """How far doors are open in a pair; None where none moves."""
+        if self.simulated is None or not self.simulated.doors:
+            return None
+        emitter = int(self.held_out[index]) // len(self.simulated.probes)
+        return tuple(self.simulated.states.openness[emitter].tolist())
 
     def __post_init__(self) -> None:
         if not len(self.held_out):
@@ -157,8 +165,9 @@ def require_same_scene(bundle: Bundle, dataset: Dataset) -> None:
     codec = bundle.manifest.codec.codec
     is_same = (codec.sample_rate, codec.samples) == (dataset.sample_rate, dataset.samples)
     if isinstance(dataset.place, LevelScene):
-        place = dataset.place.place
-        is_same &= bundle.mesh is not None and bundle.mesh.to_bytes() == place.mesh.to_bytes()
+        mesh = dataset.place.mesh if dataset.doors else dataset.place.place.mesh
+        is_same &= bundle.mesh is not None and bundle.mesh.to_bytes() == mesh.to_bytes()
+        is_same &= tuple(door.name for door in bundle.doors) == dataset.doors
     else:
         is_same &= bundle.manifest.geometry == dataset.place.geometry
     if not is_same:
@@ -169,7 +178,7 @@ def _of_simulation(dataset: Dataset) -> HeldOut:
     probes = dataset.probes
     emitter, listener = np.divmod(np.arange(len(probes) ** 2), len(probes))
     held_out = np.flatnonzero(dataset.held_out.ravel())
-    training = ~dataset.held_out.ravel() & (emitter != listener)
+    training = dataset.trained.ravel()
     return HeldOut(
         folder=dataset.folder,
         name=f"{dataset.place.id} (simulated)",
@@ -182,7 +191,7 @@ def _of_simulation(dataset: Dataset) -> HeldOut:
         delays_s=dataset.onset_s.ravel(),
         yaws=dataset.yaws,
         yaw_indices=np.arange(len(dataset.yaws)),
-        visible=dataset.surroundings.is_visible(probes[emitter[held_out]], probes[listener[held_out]]),
+        visible=dataset.is_visible(np.column_stack([emitter, listener])[held_out]),
         simulated=dataset,
     )
 

@@ -19,7 +19,7 @@ from server.acoustics.cells import Axis
 from server.acoustics.codec import Codec
 from server.core.errors import NafirError
 from server.field.directional_graph import DIRECTIONAL_INPUTS, DIRECTIONS, LOG_MAGNITUDE
-from server.field.graph import INPUTS, OUTPUTS, PATH, RESPONSE
+from server.field.graph import INPUTS, OPENNESS, OUTPUTS, PATH, RESPONSE
 from server.field.runtime import open_session
 from server.health.check import Effort, Health, check, check_fields
 from server.health.findings import LAWS
@@ -29,10 +29,10 @@ from training.baselines.held_out import measured_pairs
 from training.baselines.shaped import ShapedNearest
 from training.bundling.data_reference import reference_of
 from training.bundling.graphs import halve_weights, pose_by_pose, to_int8, to_onnx, with_metadata, with_weights
-from training.bundling.manifests import Fields, measured_manifest, simulated_manifest
+from training.bundling.manifests import Fields, measured_manifest, mesh_files, simulated_manifest
 from training.bundling.noise import choose_noise
 from training.bundling.shaped_graph import ShapedNearestGraph
-from training.data.levels.level_scene import MESH_FILE, LevelScene
+from training.data.levels.level_scene import LevelScene
 from training.data.responses import FILE, ImportedDataset, ResponseSet
 from training.evaluation.fields import INTEGRATED
 from training.learning.basis import BasisLearner
@@ -44,7 +44,7 @@ from training.learning.record import RECORD
 from training.learning.runs import Configuration, record_of
 from training.learning.train import load_learner
 from training.models.basis_field import BasisField
-from training.models.directional import ExportedDirections
+from training.models.directional import ExportedDirections, ExportedDirectionsOfDoors
 from training.models.factorised import ExportedField
 from training.models.frozen_noise import even_noise
 from training.models.naf_graph import NafGraph
@@ -99,6 +99,7 @@ class _Exported:
     rank: int | None
     codec: CodecParameters
     order: int | None = None
+    doors: tuple[str, ...] = ()
 
     @property
     def learns_phase(self) -> bool:
@@ -158,7 +159,8 @@ def export(
     if isinstance(responses, SimulatedResponses):
         manifest = simulated_manifest(responses, described, whole=whole)
         if isinstance(responses.dataset.place, LevelScene):
-            files[MESH_FILE] = responses.dataset.place.place.mesh.to_bytes()
+            level, has_doors = responses.dataset.place, len(responses.dataset.doors) > 0
+            files |= mesh_files(level, moving=has_doors)[1]
     else:
         assert isinstance(responses, ImportedDataset)
         manifest = measured_manifest(responses, described)
@@ -220,6 +222,7 @@ def _contents(exported: Sequence[_Exported], precision: Precision, seed: int) ->
             codec=None if each.codec == codec else each.codec,
             predicts="ears" if each.order is None else "directions",
             order=each.order,
+            doors=each.doors,
         )
         for title, each in zip(titles, exported, strict=True)
     }
@@ -318,6 +321,7 @@ class _Form:
     outputs: tuple[str, ...]
     known_frames: int
     order: int | None
+    doors: tuple[str, ...] = ()
 
 
 def _form_of(learner: BasisLearner) -> _Form:
@@ -326,6 +330,10 @@ def _form_of(learner: BasisLearner) -> _Form:
     if isinstance(learner, DirectionalLearner):
         order = learner.recipe.order
         outputs = (LOG_MAGNITUDE, DIRECTIONS)[: 1 + (order > 0)]
+        assert isinstance(learner.responses, SimulatedResponses)
+        if doors := learner.responses.dataset.doors:
+            inputs = (*DIRECTIONAL_INPUTS, PATH, OPENNESS)
+            return _Form(ExportedDirectionsOfDoors, inputs, outputs, 0, order, doors)
         return _Form(ExportedDirections, (*DIRECTIONAL_INPUTS, PATH), outputs, 0, order)
     raise TypeError(f"{type(learner)} has no graph")
 
@@ -352,7 +360,7 @@ def _of_a_basis(
             model = halve_weights(small)
             _check(model, module, poses, form.outputs, precision, inputs=form.inputs)
             name = f"{_sized_name(kind, field, usual_width)}{_suffix(precision)}"
-            exported.append(_Exported(name, model, kind, len(field.basis), codec, form.order))
+            exported.append(_Exported(name, model, kind, len(field.basis), codec, form.order, form.doors))
     return exported
 
 
@@ -421,8 +429,12 @@ def _poses(
     )
     yaw = rng.uniform(-np.pi, np.pi, count)
     given: dict[str, npt.NDArray[np.floating]] = {"listener": listener, "emitter": emitter, "yaw": yaw}
+    openness = None
+    if OPENNESS in inputs:
+        assert isinstance(responses, SimulatedResponses)
+        openness = given[OPENNESS] = responses.openness[rng.integers(0, len(responses.openness), count)]
     if PATH in inputs:
-        given[PATH] = Site.of(responses).paths(listener, emitter)
+        given[PATH] = Site.of(responses).paths(listener, emitter, openness)
     return tuple(given[name].astype(np.float32) for name in inputs)
 
 

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 from server.scene.bundle import MOST_TRIANGLES, Bundle, write_bundle
-from server.scene.door import MOST_DOORS, Door
+from server.scene.door import MOST_DOORS
 from server.scene.limits import MOST_SAMPLES
 from server.scene.manifest import (
     MESH_FORMAT,
@@ -14,10 +14,10 @@ from server.scene.manifest import (
     CodecParameters,
     Manifest,
     QualityLevel,
-    SceneMesh,
 )
+from training.bundling.manifests import mesh_files
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.data.levels.level_scene import MESH_FILE, LevelScene
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFileError
 
 _SAMPLE_RATE, _N_FFT, _HOP = 48_000, 512, 128
@@ -46,21 +46,13 @@ def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
     (west, south, low), (east, north, high) = place.mesh.bounds_m.tolist()
     longest_s = 2 * math.dist((west, south, low), (east, north, high)) / SPEED_OF_SOUND + _AFTER_S
     samples = _HOP * math.ceil(max(_SHORTEST_S, longest_s) * _SAMPLE_RATE / _HOP)
-    leaves, _ = scene.leaves
-    doors = [Door(**door.model_dump(exclude={"surface_mass_kg_m2"})) for door in scene.file.geometry.doors]
-    files = {MESH_FILE: scene.mesh.to_bytes()}
-    files |= {door.mesh: leaf.mesh.to_bytes() for door, leaf in zip(doors, leaves, strict=True)}
+    mesh, files = mesh_files(scene, moving=True)
     manifest = Manifest(
         format_version=MESH_FORMAT,
         id=scene.id,
         name=scene.file.name,
         description=scene.file.description,
-        mesh=SceneMesh(
-            file=MESH_FILE,
-            materials=dict(place.materials),
-            open_sky=scene.file.geometry.open_sky,
-            doors=tuple(doors),
-        ),
+        mesh=mesh,
         bounds=Bounds(minimum=(west, south, low), maximum=(east, north, high)),
         speed_of_sound=SPEED_OF_SOUND,
         air=scene.air,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from server.acoustics.decibels import power_to_db
+from server.scene.door import Door
 from server.scene.effects import EffectName
 from server.scene.geometry import Point
 from server.scene.manifest import (
@@ -73,14 +74,27 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: 
     )
 
 
+def mesh_files(level: LevelScene, *, moving: bool) -> tuple[SceneMesh, dict[str, bytes]]:
+    """What a manifest says about the mesh of a level, and its files. Doors are leaves that move, or else part of the
+    mesh, where they stand at the beginning."""
+    doors, files = [], {MESH_FILE: (level.mesh if moving else level.place.mesh).to_bytes()}
+    if moving:
+        leaves, _ = level.leaves
+        doors = [Door(**door.model_dump(exclude={"surface_mass_kg_m2"})) for door in level.file.geometry.doors]
+        files |= {door.mesh: leaf.mesh.to_bytes() for door, leaf in zip(doors, leaves, strict=True)}
+    materials = dict(level.place.materials)
+    mesh = SceneMesh(file=MESH_FILE, materials=materials, open_sky=level.file.geometry.open_sky, doors=tuple(doors))
+    return mesh, files
+
+
 def _level_manifest(level: LevelScene, responses: SimulatedResponses, fields: Fields, *, whole: bool) -> Manifest:
-    """Doors stand as they were simulated, and are part of the mesh."""
+    mesh, files = mesh_files(level, moving=len(responses.dataset.doors) > 0)
     (west, south, low), (east, north, high) = level.place.mesh.bounds_m.tolist()
     return Manifest(
         id=level.id,
         name=level.file.name,
         description=level.file.description,
-        mesh=SceneMesh(file=MESH_FILE, materials=dict(level.place.materials), open_sky=level.file.geometry.open_sky),
+        mesh=mesh,
         bounds=Bounds(minimum=(west, south, low), maximum=(east, north, high)),
         speed_of_sound=SPEED_OF_SOUND,
         air=level.air,
@@ -92,7 +106,7 @@ def _level_manifest(level: LevelScene, responses: SimulatedResponses, fields: Fi
         codec=fields.codec,
         fields=fields.fields,
         levels=fields.levels,
-        files={**fields.files, MESH_FILE: "0" * 64},
+        files={**fields.files, **dict.fromkeys(files, "0" * 64)},
     )
 
 

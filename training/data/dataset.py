@@ -10,6 +10,10 @@ If the simulation plan has one tail for all pairs, the energies of the tail are 
 held-out pairs, and once more, traced anew, for the pairs to train on. Each pair then stores only what comes before the
 tail. Reading gives the energies of whole responses.
 
+In a level with doors, each emitter is simulated with the doors in a state of its own, drawn at random
+(`training.data.door_states`). Such a file has another format, with the arrays `openness` (emitter, door) and `unseen`
+(emitter,).
+
 The file keeps the plan that it was simulated by.
 """
 
@@ -29,6 +33,7 @@ from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.surroundings import PlanSurroundings, Surroundings
 from training.data.dataset_check import DatasetError, require_possible_energies
+from training.data.door_states import DoorStates, EmitterScenes
 from training.data.levels.level_scene import SCENE_FILE, LevelScene, is_same_scene, read_scene
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.data.shared_tail import FADE_S, SharedTail
@@ -37,6 +42,8 @@ from training.data.simulation_plan import SimulationPlan
 
 SPEED_OF_SOUND = 343.0
 FORMAT = 5
+DOORS_FORMAT = 6
+"""The format of datasets whose doors move."""
 Half = Literal["choice", "report"]
 """Halves of the held-out pairs: quality levels are chosen by one, and their errors are reported on the other."""
 GEOMETRIC_ORDER: Literal[1] = 1
@@ -68,6 +75,7 @@ class Dataset:
     held_out: npt.NDArray[np.bool_]
     """(emitter, listener) True for pairs that training never sees."""
     effects: SimulationPlan
+    states: DoorStates
 
     @classmethod
     def create(cls, folder: Path, scene_path: Path, seed: int, effects: SimulationPlan) -> "Dataset":
@@ -85,7 +93,12 @@ class Dataset:
             return existing
         probes = scene.probe_positions(seed)
         yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
-        held_out = _choose_held_out(len(probes), scene.simulation.held_out_share, np.random.default_rng([seed, 1]))
+        states, rng = DoorStates.of(scene, len(probes), seed), np.random.default_rng([seed, 1])
+        has_doors = states.openness.shape[1] > 0
+        if has_doors:
+            held_out = states.held_out(rng)
+        else:
+            held_out = _choose_held_out(len(probes), scene.simulation.held_out_share, rng)
         folder.mkdir(parents=True, exist_ok=True)
         scene_path = scene_path / SCENE_FILE if scene_path.is_dir() else scene_path
         (folder / SCENE_FILE).write_bytes(scene_path.read_bytes())
@@ -94,9 +107,13 @@ class Dataset:
         # The file gets its final name when it is whole: an interrupted start must not look like a damaged dataset.
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
-            file.attrs.update(format=FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate)
+            file.attrs.update(
+                format=DOORS_FORMAT if has_doors else FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate
+            )
             file.attrs["effects"] = json.dumps(effects.to_json())
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
+            if has_doors:
+                file["openness"], file["unseen"] = states.openness, states.unseen
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
             histogram = _histogram(scene, effects)
             file.create_dataset(
@@ -107,7 +124,7 @@ class Dataset:
                 fillvalue=-np.inf,
             )
         partial.replace(folder / "pairs.h5")
-        return cls(folder, scene, seed, probes, yaws, held_out, effects)
+        return cls(folder, scene, seed, probes, yaws, held_out, effects, states)
 
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
@@ -119,20 +136,24 @@ class Dataset:
             scene = read_scene(folder / SCENE_FILE)
             with h5py.File(folder / "pairs.h5", "r") as file:
                 found = file.attrs.get("format")
-                if found != FORMAT:
+                if found not in (FORMAT, DOORS_FORMAT):
                     holds = f", which holds {_HOLDS[found]}" if found in _HOLDS else ""
                     raise DatasetError(
-                        f"{folder}: format {found}{holds}, expected {FORMAT}: simulate into an empty folder"
+                        f"{folder}: format {found}{holds}, expected {FORMAT} or {DOORS_FORMAT}: "
+                        "simulate into an empty folder"
                     )
-                done = file["done"][()]
+                done, probes = file["done"][()], file["probes"][()]
+                has_doors = found == DOORS_FORMAT
+                states = DoorStates(file["openness"][()], file["unseen"][()]) if has_doors else None
                 dataset = cls(
                     folder,
                     scene,
                     int(file.attrs["seed"]),
-                    file["probes"][()],
+                    probes,
                     file["yaws"][()],
                     file["held_out"][()],
                     SimulationPlan.from_json(json.loads(file.attrs["effects"])),
+                    states or DoorStates.none(len(probes)),
                 )
         except (OSError, KeyError, TypeError, ValueError) as exc:
             raise DatasetError(f"{folder}: not a dataset folder: {exc}") from exc
@@ -148,9 +169,13 @@ class Dataset:
             ("probes", self.probes, (len(self.probes), 3)),
             ("yaws", self.yaws, (self.place.simulation.yaws,)),
             ("held_out", self.held_out, (len(self.probes), len(self.probes))),
+            ("openness", self.states.openness, (len(self.probes), self._doors)),
+            ("unseen", self.states.unseen, (len(self.probes),)),
         ):
             if values.shape != shape or not np.isfinite(values).all():
                 raise DatasetError(f"{path}: {name}: has shape {values.shape}, expected {shape} of finite values")
+        if np.any((self.states.openness < 0) | (self.states.openness > 1)):
+            raise DatasetError(f"{path}: openness: is not from 0 to 1 everywhere; simulate into an empty folder")
         pairs = len(TAKES), len(self.probes), len(self.probes)
         try:
             with h5py.File(path, "r") as file:
@@ -185,7 +210,40 @@ class Dataset:
     @cached_property
     def onset_s(self) -> npt.NDArray[np.float64]:
         """(emitter, listener) seconds until the first sound can arrive, along the shortest path around corners."""
-        return self.place.path_length_m(self.probes[:, None], self.probes[None]) / SPEED_OF_SOUND
+        length_m = np.empty((len(self.probes), len(self.probes)))
+        for one, emitters in self.scenes.groups(np.arange(len(self.probes))).items():
+            length_m[emitters] = self.scenes.of(one).path_length_m(self.probes[emitters, None], self.probes[None])
+        return length_m / SPEED_OF_SOUND
+
+    @cached_property
+    def scenes(self) -> EmitterScenes:
+        """The place as each emitter finds it."""
+        return EmitterScenes(self.place, self.states)
+
+    @property
+    def _doors(self) -> int:
+        """The number of doors that move."""
+        return int(self.states.openness.shape[1])
+
+    @property
+    def doors(self) -> tuple[str, ...]:
+        """The names of the doors that move."""
+        return tuple(door.name for door in self.place.file.geometry.doors) if self._doors else ()  # type: ignore[union-attr]
+
+    @cached_property
+    def trained(self) -> npt.NDArray[np.bool_]:
+        """(emitter, listener) True for pairs to train on. Neither these nor held out are a probe with itself, and pairs
+        in unseen states of doors whose reverse is trained on."""
+        return ~self.held_out & ~np.eye(len(self.probes), dtype=bool) & ~self.states.unseen[:, None]
+
+    def is_visible(self, pairs: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """(pair,) whether emitter and listener of pairs (pair, 2) see each other."""
+        visible = np.zeros(len(pairs), dtype=bool)
+        for one, here in self.scenes.groups(pairs[:, 0]).items():
+            scene, (emitter, listener) = self.scenes.of(one), pairs[here].T
+            surroundings = scene.surroundings if isinstance(scene, LevelScene) else self.surroundings
+            visible[here] = surroundings.is_visible(self.probes[emitter], self.probes[listener])
+        return visible
 
     def remaining(self) -> list[int]:
         """Numbers of the emitters that are not simulated yet."""
@@ -219,8 +277,7 @@ class Dataset:
 
     def pairs(self, *, held_out: bool) -> npt.NDArray[np.int64]:
         """(pair, 2) emitter and listener of each held-out pair or, without `held_out`, of each training pair."""
-        chosen = self.held_out if held_out else ~self.held_out & ~np.eye(len(self.probes), dtype=bool)
-        return np.argwhere(chosen)
+        return np.argwhere(self.held_out if held_out else self.trained)
 
     def held_out_half(self, half: Half) -> npt.NDArray[np.int64]:
         """(pair, 2) emitter and listener of a random half of the held-out pairs: what is chosen by one half is reported

@@ -1,6 +1,7 @@
 """The fields of scene bundles as columns of an evaluation; also writes measured errors into the bundle."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import Accuracy, QualityLevel
 from training.baselines.held_out import EvaluationError, HeldOut, Responses, require_same_scene
 from training.baselines.moved_nodes import with_moved_nodes
+from training.baselines.states import ByState
 from training.evaluation.evaluate import METRICS, Column, Evaluation, Source
 from training.learning.record import RECORD, TrainingRecord
 
@@ -79,15 +81,19 @@ def field_source(field: AcousticField, held_out: HeldOut) -> Source:
     is_moved = field.kind.reuses_responses
     fields = [with_moved_nodes(field, rng) for _ in range(_LATTICE_POSITIONS)] if is_moved else [field]
     filters = held_out.filters or kemar(held_out.sample_rate)
-    wholes = [FullResponse(moved, filters) for moved in fields]
+    wholes = [ByState(moved, partial(FullResponse, filters=filters)) for moved in fields]
     listeners, emitters = held_out.listeners, held_out.emitters
 
     def source(index: int, yaw_indices: npt.NDArray[np.integer]) -> Responses:
         shape = (len(yaw_indices), 3)
-        responses = wholes[index % len(wholes)].impulse_responses(
-            np.broadcast_to(listeners[index], shape),
-            np.broadcast_to(emitters[index], shape),
-            held_out.yaws[yaw_indices],
+        responses = (
+            wholes[index % len(wholes)]
+            .at(held_out.openness(index))
+            .impulse_responses(
+                np.broadcast_to(listeners[index], shape),
+                np.broadcast_to(emitters[index], shape),
+                held_out.yaws[yaw_indices],
+            )
         )
         return of_length(responses, held_out.samples)
 

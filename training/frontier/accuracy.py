@@ -13,9 +13,11 @@ import numpy.typing as npt
 
 from server.acoustics.audibility import in_jnd
 from server.acoustics.codec import Codec
+from server.acoustics.doors import Openness
 from server.acoustics.metrics import SPECTRAL_LOSS, parameter_errors, spectral_loss
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.field.field import AcousticField
+from training.baselines.states import ByState
 from training.data.dataset import TAKES, Dataset, Half
 from training.frontier.heard_by_bus import full_response
 from training.simulation.references import References
@@ -40,6 +42,8 @@ class Entry:
     repeat: _Responses | None
     """The second simulation of a held-out pair."""
     parameters: RoomParameters
+    openness: Openness | None = None
+    """How far doors are open; None where none moves."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +81,15 @@ class Estimate:
     pose is computed after its neighbour, as on a walk."""
 
     def __init__(self, field: AcousticField) -> None:
-        self._whole = full_response(field)
+        self._whole = ByState(field, full_response)
         self._is_warm = field.level.phase.warm
 
     def __call__(self, entry: Entry) -> _Responses:
         listeners, emitters = (np.tile(end, (len(entry.yaws), 1)) for end in (entry.listener, entry.emitter))
+        whole = self._whole.at(entry.openness)
         if self._is_warm:
-            self._whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
-        return self._whole.impulse_responses(listeners, emitters, entry.yaws)
+            whole.impulse_responses(listeners + np.array([_STEP_M, 0.0, 0.0]), emitters, entry.yaws)
+        return whole.impulse_responses(listeners, emitters, entry.yaws)
 
 
 @dataclass(frozen=True)
@@ -158,11 +163,12 @@ class SampledPairs:
             entry = Entry(
                 *ends,
                 yaws=heads,
-                visible=bool(dataset.surroundings.is_visible(*ends)),
+                visible=bool(dataset.is_visible(np.array([[emitter, listener]]))[0]),
                 reference=reference,
                 reflected=first.reflected(emitter, listener),
                 repeat=second.complete(emitter, listener) if held_out else None,
                 parameters=measure(reference, self._sample_rate),
+                openness=tuple(dataset.states.openness[emitter].tolist()) if dataset.doors else None,
             )
             self.entries.append(entry)
 

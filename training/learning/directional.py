@@ -57,7 +57,12 @@ class DirectionalLearner(BasisLearner):
         _, first, self._pair = np.unique(responses.pair[trainable], return_index=True, return_inverse=True)
         used, _ = split(responses, share=configuration.share, seed=configuration.seed)
         ends = [responses.ends(row) for row in trainable[first]]
-        self._partner = _exchanged(ends, set(self._pair[used].tolist())) if recipe.reciprocal else np.arange(len(ends))
+        self._openness = responses.openness[trainable[first]].astype(np.float32)
+        self._partner = (
+            _exchanged(ends, set(self._pair[used].tolist()), self._openness)
+            if recipe.reciprocal
+            else np.arange(len(ends))
+        )
 
     def prepare(self, progress: Progress) -> None:
         folder = self.responses.file.parent / TARGETS
@@ -79,7 +84,9 @@ class DirectionalLearner(BasisLearner):
             listener, emitter = (
                 end + rng.normal(0, self.recipe.noise_m, end.shape).astype(np.float32) for end in (listener, emitter)
             )
-        poses = (listener, emitter, self.site.paths(listener, emitter))
+        openness = self._openness[pairs]
+        told = (openness,) if openness.shape[1] else ()
+        poses = (listener, emitter, self.site.paths(listener, emitter, openness), *told)
         return tuple(map(torch.from_numpy, poses)), (self._flat(rows),)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
@@ -99,8 +106,12 @@ class DirectionalLearner(BasisLearner):
         return rows[np.sort(first)]
 
 
-def _exchanged(ends: Sequence[tuple[int, int]], used: Set[int]) -> npt.NDArray[np.int64]:
-    """(pair,) the number of the pair with exchanged ends, where both are used, else that of the pair itself."""
+def _exchanged(
+    ends: Sequence[tuple[int, int]], used: Set[int], openness: npt.NDArray[np.float32]
+) -> npt.NDArray[np.int64]:
+    """(pair,) the number of the pair with exchanged ends, where both are used with doors equally open, else that of the
+    pair itself."""
     numbers = {pair: number for number, pair in enumerate(ends) if number in used}
     partners = [numbers.get((listener, emitter), number) for number, (emitter, listener) in enumerate(ends)]
-    return np.array([partner if number in used else number for number, partner in enumerate(partners)])
+    found = np.array([partner if number in used else number for number, partner in enumerate(partners)])
+    return np.where((openness == openness[found]).all(axis=1), found, np.arange(len(found)))

@@ -14,7 +14,14 @@ from training.learning.distillation import DistillationTargets, distillation_tar
 from training.learning.energies import RAYLEIGH_DEFICIT, EnergyError
 from training.learning.learner import Losses, Rows
 from training.learning.naf import NafLearner
-from training.learning.runs import Configuration, FactorisedRecipe, RecipeError, require_same_data, restore
+from training.learning.runs import (
+    Configuration,
+    FactorisedRecipe,
+    RecipeError,
+    require_same_data,
+    require_still_doors,
+    restore,
+)
 from training.models.cells import Cells
 from training.models.encoders import FieldShape
 from training.models.factorised import FactorisedField
@@ -46,6 +53,7 @@ class FactorisedLearner(BasisLearner):
             raise RecipeError(
                 "swap: a head is no loudspeaker, so binaural responses differ with their ends exchanged; leave it off"
             )
+        require_still_doors(responses, configuration.kind)
         self.responses = responses
         self.recipe = recipe
         is_simulated = isinstance(responses, SimulatedResponses)

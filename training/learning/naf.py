@@ -13,7 +13,7 @@ from training.data.responses import ResponseSet
 from training.learning.basis import TARGETS
 from training.learning.held import HeldTargets
 from training.learning.learner import Losses, Rows
-from training.learning.runs import Configuration, NafRecipe, RecipeError
+from training.learning.runs import Configuration, NafRecipe, RecipeError, require_still_doors
 from training.learning.schedule import decay_to_a_tenth
 from training.models.naf import Naf, NafShape
 from training.models.site import Site
@@ -42,6 +42,7 @@ class NafLearner:
             recipe.whole or shape.domain == "time" or not isinstance(responses, SimulatedResponses)
         ):
             raise RecipeError("field: only the spectrograms of simulated late reverberation have expected values")
+        require_still_doors(responses, configuration.kind)
         self.responses = _whole(responses) if recipe.whole else responses
         self.recipe = recipe
         self.codec = codec_of(responses, N_FFT)

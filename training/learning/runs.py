@@ -354,6 +354,12 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
     partial.replace(path)
 
 
+def require_still_doors(responses: ResponseSet, kind: str) -> None:
+    """Raise RecipeError for a level whose doors move, if fields of this kind do not know how far they are open."""
+    if isinstance(responses, SimulatedResponses) and responses.dataset.doors:
+        raise RecipeError(f"field: the doors of this level move, and {kind} is not told of them: train directional")
+
+
 def _identity(responses: ResponseSet) -> dict[str, Any]:
     """Facts that identify the data, wherever they are stored."""
     if isinstance(responses, SimulatedResponses):

@@ -64,8 +64,18 @@ class ExportedDirections(ExportedBasis):
         self._silence = float(torch.log(torch.tensor(cells.codec.log_floor)))
 
     def forward(self, listener: Tensor, emitter: Tensor, path: Tensor) -> tuple[Tensor, ...]:
-        parts = torch.split(self._flat(listener, emitter, path), self._sizes, dim=1)
+        return self._parts(listener, emitter, path)
+
+    def _parts(self, *pose: Tensor) -> tuple[Tensor, ...]:
+        parts = torch.split(self._flat(*pose), self._sizes, dim=1)
         levels, *directions = (part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True))
         # guard: no direction has more power than there is
         shares = [torch.clamp(part, min=-1.0, max=1.0) for part in directions]
         return torch.clamp(levels, min=self._silence), *shares
+
+
+class ExportedDirectionsOfDoors(ExportedDirections):
+    """The same with doors, of which `openness` (B, door) says how far they are open."""
+
+    def forward(self, listener: Tensor, emitter: Tensor, path: Tensor, openness: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+        return self._parts(listener, emitter, path, openness)

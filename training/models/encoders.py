@@ -4,6 +4,7 @@ path between them, of which the network is told.
 A path (B, DESCRIPTION) is described as in `server.acoustics.sound_path.DescribedPaths`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ _YAW_HARMONICS = 3
 _PATH_DIRECTIONS = 2 + 2
 """Number of features that follow the sight feature: the path's directions at both ends."""
 _POSITION_OCTAVES = 3
+_AJAR = 0.03
+"""From this openness on, a network is told its logarithm, as levels go; below, a door is nearly shut."""
 _EARS_M = 1.5
 """The height above a floor of its grid."""
 _MOST_LOG_PRECISION = 14.0
@@ -89,6 +92,8 @@ class _Encoder(nn.Module):
     def __init__(self, extent: Extent, shape: FieldShape, reach: Reach) -> None:
         super().__init__()
         self._nearest_m = reach.nearest_m
+        self.doors = extent.doors
+        """The number of doors of which it is told how far they are open."""
         self.register_buffer("_low", torch.tensor(reach.low, dtype=torch.float32), persistent=False)
         self.register_buffer("_high", torch.tensor(reach.high, dtype=torch.float32), persistent=False)
         self.sees_all = not extent.hides
@@ -110,7 +115,9 @@ class _Encoder(nn.Module):
     def _keep(self, name: str, values: npt.NDArray[np.floating | np.integer]) -> None:
         self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
 
-    def _features(self, listener: Tensor, emitter: Tensor, path: Tensor, azimuth: Tensor) -> Tensor:
+    def _features(
+        self, listener: Tensor, emitter: Tensor, path: Tensor, azimuth: Tensor, openness: Sequence[Tensor] = ()
+    ) -> Tensor:
         """(B, feature) all features but those of the head, with the `azimuth` of the path at the listener."""
         length, visible, directions = torch.split(path, [1, 1, _PATH_DIRECTIONS], dim=-1)
         distance = torch.clamp(length, min=self._nearest_m)
@@ -118,6 +125,7 @@ class _Encoder(nn.Module):
         scalars = torch.cat([torch.log(distance), 1 / (1 + distance), (emitter - listener)[:, 2:] / distance], dim=-1)
         return torch.cat(
             [
+                *(part for shares in openness for part in (shares, torch.log(shares + _AJAR))),
                 self._grid(ends).flatten(1),
                 self._waves(ends).flatten(1),
                 azimuth,
@@ -149,10 +157,12 @@ class PathEncoder(_Encoder):
 
     def __init__(self, extent: Extent, shape: FieldShape, reach: Reach) -> None:
         super().__init__(extent, shape, reach)
-        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1, DESCRIPTION)).shape[-1]
+        openness = [torch.zeros(1, extent.doors)] if extent.doors else []
+        self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1, DESCRIPTION), *openness).shape[-1]
 
-    def forward(self, listener: Tensor, emitter: Tensor, path: Tensor) -> Tensor:
-        return self._features(listener, emitter, path, self._multiples(_at_listener(path)))
+    def forward(self, listener: Tensor, emitter: Tensor, path: Tensor, *openness: Tensor) -> Tensor:
+        """`openness` (B, door) is given if there are doors."""
+        return self._features(listener, emitter, path, self._multiples(_at_listener(path)), openness)
 
 
 class PoseEncoder(_Encoder):

@@ -8,9 +8,10 @@ import numpy.typing as npt
 
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.mesh_plan import floors_of
-from server.acoustics.sound_path import SoundPathFinder
+from server.acoustics.sound_path import DESCRIPTION, SoundPathFinder
 from server.acoustics.surroundings import PlanSurroundings, Surroundings
 from training.data.dataset import SPEED_OF_SOUND
+from training.data.door_states import EmitterScenes, alike
 from training.data.levels.level_scene import LevelScene
 from training.data.responses import ResponseSet
 from training.simulation.responses import SimulatedResponses
@@ -49,6 +50,8 @@ class Extent:
     high: npt.NDArray[np.float64]
     hides: bool
     floors_m: tuple[float, ...] = ()
+    doors: int = 0
+    """The number of doors whose openness a field is told."""
 
     @classmethod
     def of_plan(cls, plan: FloorPlan) -> "Extent":
@@ -57,9 +60,10 @@ class Extent:
         return cls(np.array([*low, 0.0]), np.array([*high, plan.height_m]), len(plan.bend_corners) > 0)
 
     @classmethod
-    def of_level(cls, level: LevelScene) -> "Extent":
+    def of_level(cls, level: LevelScene, doors: int = 0) -> "Extent":
         low, high = level.surroundings.bounds_m
-        return cls(low, high, level.surroundings.has_obstacles, tuple(floors_of(level.place.mesh)))
+        has_obstacles = level.surroundings.has_obstacles
+        return cls(low, high, has_obstacles, tuple(floors_of(level.place.mesh)), doors)
 
 
 @dataclass(frozen=True)
@@ -76,23 +80,41 @@ class Site:
     yaws: npt.NDArray[np.float64]
     listener_axes: tuple[int, ...]
     emitter_axes: tuple[int, ...]
+    scenes: EmitterScenes | None = None
+    """The place in other states of its doors, if these move."""
 
     @cached_property
     def _finder(self) -> SoundPathFinder:
         return self.surroundings.sound_paths(SPEED_OF_SOUND)
 
-    def paths(self, listeners: npt.NDArray[np.floating], emitters: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-        """Describe the shortest paths of pairs, (B, 3) and (B, 3), as a field is told of them."""
-        return self._finder.describe(listeners, emitters).described
+    def paths(
+        self,
+        listeners: npt.NDArray[np.floating],
+        emitters: npt.NDArray[np.floating],
+        openness: npt.NDArray[np.floating] | None = None,
+    ) -> npt.NDArray[np.float32]:
+        """Describe the shortest paths of pairs, (B, 3) and (B, 3), as a field is told of them: with doors open so far,
+        (B, door), or as at the beginning."""
+        if openness is None or self.scenes is None:
+            return self._finder.describe(listeners, emitters).described
+        described = np.empty((len(listeners), DESCRIPTION), np.float32)
+        for here in alike(openness):
+            scene = self.scenes.at(openness[here[0]])
+            assert isinstance(scene, LevelScene)
+            described[here] = scene.sound_paths.describe(listeners[here], emitters[here]).described
+        return described
 
     @classmethod
     def of(cls, responses: ResponseSet) -> "Site":
         ends = responses.listener, responses.emitter
         positions = np.concatenate(ends)
         low, high = positions.min(axis=0), positions.max(axis=0)
+        scenes = None
         if isinstance(responses, SimulatedResponses) and isinstance(responses.dataset.place, LevelScene):
             level = responses.dataset.place
-            extent = Extent.of_level(level)
+            has_doors = len(responses.dataset.doors) > 0
+            extent = Extent.of_level(level, len(responses.dataset.doors))
+            scenes = responses.dataset.scenes if has_doors else None
             surroundings: Surroundings = level.surroundings
             low[:2], high[:2] = extent.low[:2], extent.high[:2]
         else:
@@ -111,4 +133,4 @@ class Site:
         # Rounded, so that a heading that was stored as slightly different floats counts once.
         yaws = np.unique(np.round(np.remainder(responses.yaw, 2 * np.pi), 6))
         headings = np.asarray(yaws[yaws < 2 * np.pi - 1e-5], np.float64)
-        return cls(extent, surroundings, low, high, headings, axes[0], axes[1])
+        return cls(extent, surroundings, low, high, headings, axes[0], axes[1], scenes)

@@ -37,7 +37,7 @@ class ExpectedSpectrograms:
         self._codec = codec
         directions = sphere_directions(dataset.place.simulation.arrival_directions)
         self._synthesis = BinauralSynthesis(kemar(dataset.sample_rate), directions, dataset.yaws, dataset.samples)
-        self._mirrored = MirroredReflections(dataset.place, dataset.effects, dataset.probes)
+        self._mirrored = MirroredReflections(dataset.scenes, dataset.effects, dataset.probes)
 
     @cached_property
     def _arrival_products(self) -> _Singles:

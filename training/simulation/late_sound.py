@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
-from training.data.simulated_scene import SimulatedScene
+from training.data.door_states import EmitterScenes
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.synthesis import BinauralSynthesis
 from training.simulation.tracing import RoomTracer
@@ -24,7 +24,7 @@ _Images = list[tuple[_Floats, _Floats]]
 class MirroredReflections:
     """The images of emitters at `probes` (probe, xyz) that a field's sound contains. Several threads may use one."""
 
-    scene: SimulatedScene
+    scenes: EmitterScenes
     plan: SimulationPlan
     probes: _Floats
     _last: dict[str, tuple[int, _Images]] = field(default_factory=dict)
@@ -34,7 +34,7 @@ class MirroredReflections:
         found = self._last.get("images")
         if found is None or found[0] != emitter:
             # Images for all listeners take as long as images for one, and pairs come in the order of emitters.
-            tracer = RoomTracer.of(self.scene, self.plan, self.probes, least_order=GEOMETRIC_ORDER + 1)
+            tracer = RoomTracer.of(self.scenes.of(emitter), self.plan, self.probes, least_order=GEOMETRIC_ORDER + 1)
             found = emitter, tracer.images(self.probes[emitter])
             self._last["images"] = found
         return found[1][listener]
@@ -54,7 +54,7 @@ class LateSound:
         place = probes[listener]
         response = self.synthesis.specular(*self.mirrored.of_pair(emitter, listener), place)
         if energy.any():
-            onset_m = float(self.mirrored.scene.path_length_m(probes[emitter], place))
+            onset_m = float(self.mirrored.scenes.of(emitter).path_length_m(probes[emitter], place))
             rng = np.random.default_rng([self.seed, 5, emitter, take, listener])
             response += self.synthesis.late(energy, onset_m / SPEED_OF_SOUND, rng)
         return response

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from server.rendering.hrtf import kemar
 from training.data.dataset import own_duration_s
+from training.data.door_states import DoorStates, EmitterScenes
 from training.data.shared_tail import TRAINING, SharedTail
 from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
@@ -43,6 +44,8 @@ class PairSimulation:
     plan: SimulationPlan
     tail: SharedTail | None = None
     prepared_s: float = 0.0
+    states: DoorStates | None = None
+    """How the doors stand for each emitter; as at the beginning if None."""
 
     @classmethod
     def prepare(
@@ -54,11 +57,12 @@ class PairSimulation:
         seed: int,
         plan: SimulationPlan,
         most_tail_rays: int | None = None,
+        states: DoorStates | None = None,
     ) -> "PairSimulation":
         """Prepare a simulation. With `most_tail_rays`, the tail is traced with at most this many rays, to predict how
         long all of them would take."""
         began_s = process_time()
-        simulation = cls(scene, probes, yaws, seed, plan)
+        simulation = cls(scene, probes, yaws, seed, plan, states=states)
         if plan.tail_start_s is None:
             return simulation
         generators = [np.random.default_rng([seed, 3, take]) for take in range(TRAINING + 1)]
@@ -87,10 +91,14 @@ class PairSimulation:
         """(listener, direction, band, bin) energies of each listener's own diffuse sound; with a shared tail, only of
         the part before it."""
         tracer = RoomTracer.of(
-            self.scene, self.plan, self.probes[listeners], duration_s=own_duration_s(self.scene, self.plan)
+            self.scenes.of(emitter), self.plan, self.probes[listeners], duration_s=own_duration_s(self.scene, self.plan)
         )
         rng = np.random.default_rng([self.seed, 2, emitter, take])
         return tracer.energy(self.probes[emitter], rays=self.plan.rays, rng=rng)
+
+    @cached_property
+    def scenes(self) -> EmitterScenes:
+        return EmitterScenes(self.scene, self.states or DoorStates.none(len(self.probes)))
 
     @cached_property
     def late_sound(self) -> LateSound:
@@ -99,7 +107,7 @@ class PairSimulation:
         directions = sphere_directions(settings.arrival_directions)
         samples = round(settings.duration_s * settings.sample_rate)
         synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, self.yaws, samples)
-        return LateSound(MirroredReflections(self.scene, self.plan, self.probes), self.seed, synthesis)
+        return LateSound(MirroredReflections(self.scenes, self.plan, self.probes), self.seed, synthesis)
 
 
 def _tail_energy(

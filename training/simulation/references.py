@@ -41,21 +41,31 @@ class GeometricSound:
         return BinauralSynthesis(filters, directions, heads, dataset.samples)
 
     @cached_property
-    def _direct_paths(self) -> DirectPaths:
-        return DirectPaths.of(self.dataset.place, self.dataset.effects)
+    def _direct_paths(self) -> dict[int, DirectPaths]:
+        """By emitter."""
+        dataset = self.dataset
+        found: dict[int, DirectPaths] = {}
+        for one, emitters in dataset.scenes.groups(np.arange(len(dataset.probes))).items():
+            paths = DirectPaths.of(dataset.scenes.of(one), dataset.effects)
+            found |= dict.fromkeys(emitters.tolist(), paths)
+        return found
 
     @cached_property
     def _images(self) -> list[list[tuple[_Floats, _Floats]]]:
         """The positions and amplitudes of the first reflections, by emitter and listener."""
         dataset = self.dataset
-        tracer = RoomTracer.of(dataset.place, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
-        return [tracer.images(emitter) for emitter in dataset.probes]
+        found: dict[int, list[tuple[_Floats, _Floats]]] = {}
+        for one, emitters in dataset.scenes.groups(np.arange(len(dataset.probes))).items():
+            scene = dataset.scenes.of(one)
+            tracer = RoomTracer.of(scene, dataset.effects, dataset.probes, image_order=GEOMETRIC_ORDER)
+            found |= {int(emitter): tracer.images(dataset.probes[emitter]) for emitter in emitters}
+        return [found[emitter] for emitter in range(len(found))]
 
     def direct(self, emitter: int, listener: int) -> _Responses:
         """(yaw, ear, sample) direct sound. Behind walls it bends around corners, or is silent if the plan has no
         diffraction."""
         ends = self.dataset.probes[emitter], self.dataset.probes[listener]
-        return self.synthesis.specular(*self._direct_paths.images(*ends), ends[1])
+        return self.synthesis.specular(*self._direct_paths[emitter].images(*ends), ends[1])
 
     def first_reflections(self, emitter: int, listener: int) -> _Responses:
         """(yaw, ear, sample) first reflections."""
@@ -82,7 +92,7 @@ class References:
         self._dataset = dataset
         self.take = take
         self._geometric = GeometricSound(dataset, filters, heads)
-        mirrored = MirroredReflections(dataset.place, dataset.effects, dataset.probes)
+        mirrored = MirroredReflections(dataset.scenes, dataset.effects, dataset.probes)
         self._late = LateSound(mirrored, dataset.seed, self._geometric.synthesis)
 
     def reflected(self, emitter: int, listener: int) -> _Responses:

@@ -20,10 +20,10 @@ class SimulatedResponses:
 
     def __init__(self, dataset: Dataset, *, whole: bool = False) -> None:
         self.dataset, self.whole = dataset, whole
-        probes = len(dataset.probes)
-        self._pairs = np.argwhere(~np.eye(probes, dtype=bool))
+        self._pairs = np.argwhere(dataset.trained | dataset.held_out)
         yaws = len(dataset.yaws)
         emitter, listener = np.repeat(self._pairs, yaws, axis=0).T
+        self.openness = dataset.states.openness[emitter]
         self.emitter, self.listener = dataset.probes[emitter], dataset.probes[listener]
         self.yaw = np.tile(dataset.yaws, len(self._pairs))
         self.pair = np.repeat(np.arange(len(self._pairs)), yaws)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from rich.progress import Progress
 
 from training.data.dataset import Dataset
+from training.data.door_states import DoorStates
 from training.data.levels.level_scene import LevelScene, read_scene
 from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan, overrides_among
@@ -33,7 +34,10 @@ def prepared(
     `PairSimulation.prepare`."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     probes = scene.probe_positions(seed)
-    return PairSimulation.prepare(scene, probes, yaws, seed=seed, plan=plan, most_tail_rays=most_tail_rays)
+    states = DoorStates.of(scene, len(probes), seed)
+    return PairSimulation.prepare(
+        scene, probes, yaws, seed=seed, plan=plan, most_tail_rays=most_tail_rays, states=states
+    )
 
 
 def simulate(
@@ -75,24 +79,25 @@ def simulate(
 
 @dataclass(frozen=True)
 class _Emitter:
-    """An emitter to simulate, and the listeners of its second take."""
+    """An emitter to simulate, and the listeners of its first and of its second take."""
 
     number: int
+    listeners: npt.NDArray[np.int64]
     repeated: npt.NDArray[np.int64]
 
 
 def _emitters(dataset: Dataset, remaining: Iterable[int]) -> Iterable[Job[_Emitter]]:
     for number in remaining:
-        emitter = _Emitter(number, np.flatnonzero(dataset.held_out[number]))
+        repeated = dataset.held_out[number]
+        emitter = _Emitter(number, np.flatnonzero(dataset.trained[number] | repeated), np.flatnonzero(repeated))
         yield Job(f"scene {dataset.place.id}, emitter {number}", emitter)
 
 
 def _simulate(simulation: PairSimulation, emitter: _Emitter, is_over: IsOver) -> _Takes:
     """The log energies of an emitter by take and listener; the second take has only the `repeated` listeners. Raises
     CancelledError once it is over."""
-    listeners = np.flatnonzero(np.arange(len(simulation.probes)) != emitter.number)
     takes = []
-    for number, wanted in enumerate((listeners, emitter.repeated)):
+    for number, wanted in enumerate((emitter.listeners, emitter.repeated)):
         energies = simulation.energies(emitter.number, wanted, number)
         if is_over():
             raise CancelledError

@@ -1,14 +1,14 @@
 """The folder of an imported level: `scene.toml`, the mesh, and a mesh for each door.
 
 `scene.toml` is a scene file whose geometry is a mesh; its other tables are those of any scene file. Heights of probes
-are above the floor that is below them. Doors stand as they are at the beginning.
+are above the floor that is below them. Doors stand as they are at the beginning, unless `with_doors` moves them.
 """
 
 import hashlib
 import json
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, count
 from pathlib import Path
@@ -32,6 +32,8 @@ from training.data.scene_file import FEWEST_PROBES, Probes, SceneFile, SceneFile
 
 SCENE_FILE, MESH_FILE = "scene.toml", "geometry.npz"
 _SPEED_OF_SOUND = 343.0
+_SWEPT = np.linspace(0, 1, 9).tolist()
+"""Where doors may stand, no probe is."""
 _Floats = npt.NDArray[np.float64]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+\.npz$")]
 
@@ -122,6 +124,15 @@ class LevelScene:
         mesh = TriangleMesh.joined([self.mesh, *at])
         return MeshGeometry(mesh, {name: materials[name] for name in mesh.materials})
 
+    def with_doors(self, openness: Sequence[float]) -> "LevelScene":
+        """The same level with its doors so far open, in their order."""
+        geometry = self.file.geometry
+        doors = [
+            door.model_copy(update={"openness": share}) for door, share in zip(geometry.doors, openness, strict=True)
+        ]
+        moved = geometry.model_copy(update={"doors": tuple(doors)})
+        return replace(self, file=self.file.model_copy(update={"geometry": moved}))
+
     @cached_property
     def leaves(self) -> tuple[tuple[DoorLeaf, ...], Mapping[str, Material]]:
         """The leaves of the doors, and all materials. A door with a mass has materials of its own."""
@@ -147,7 +158,7 @@ class LevelScene:
         return MeshSurroundings(self.place.mesh, open_sky=self.file.geometry.open_sky)
 
     @cached_property
-    def _paths(self) -> SoundPathFinder:
+    def sound_paths(self) -> SoundPathFinder:
         return self.surroundings.sound_paths(_SPEED_OF_SOUND)
 
     def probe_positions(self, seed: int) -> _Floats:
@@ -157,6 +168,10 @@ class LevelScene:
             places = probe_places(self.surroundings, self.file.probes, np.random.default_rng([seed, 0]))
         except SceneFileError as exc:
             raise SceneFileError(f"{self.id}: {exc}") from exc
+        for share in _SWEPT if self.doors else ():
+            surroundings = self.with_doors([share] * len(self.doors)).surroundings
+            clear = surroundings.tree.distance_m(places) >= self.file.probes.wall_clearance_m
+            places = places[clear & surroundings.contains(places)]
         if len(places) < FEWEST_PROBES:
             raise SceneFileError(
                 f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit above the floors, "
@@ -169,7 +184,7 @@ class LevelScene:
         """(...,) lengths of the shortest paths of sound between points; straight ones where there is none."""
         ends = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
         flat = [end.reshape(-1, 3) for end in ends]
-        return self._paths.describe(*flat).length_m.reshape(ends[0].shape[:-1])
+        return self.sound_paths.describe(*flat).length_m.reshape(ends[0].shape[:-1])
 
     @classmethod
     def read(cls, path: Path) -> "LevelScene":

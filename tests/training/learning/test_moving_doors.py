@@ -1,0 +1,206 @@
+"""Fields of levels whose doors move: simulated and learned in states drawn at random, measured in others."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from server.acoustics.decibels import power_to_db
+from server.field.fields_by_level import FieldsByLevel
+from server.scene.bundle import Bundle
+from tests.two_rooms import BEFORE, BEHIND, SWING, WOOD, door, leaf, rooms
+from training.baselines.held_out import open_held_out, require_same_scene
+from training.bundling.export import export
+from training.data.dataset import Dataset
+from training.data.dataset_check import DatasetError
+from training.data.door_states import DoorStates, alike
+from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene, SceneDoor
+from training.data.scene_file import SceneFile
+from training.evaluation.fields import field_columns
+from training.frontier.accuracy import Estimate, SampledPairs
+from training.learning.directional import DirectionalLearner
+from training.learning.runs import RecipeError, configure
+from training.learning.train import train
+from training.models.targets import codec_of
+from training.parallel.jobs import open_jobs
+from training.simulation.references import References
+from training.simulation.responses import SimulatedResponses
+from training.simulation.run import simulate
+from training.simulation.tracing import RoomTracer
+
+APARTMENT = SceneFile.read(Path(__file__).resolve().parents[3] / "training/scenes/apartment.toml")
+QUIET = Progress(disable=True)
+SETTINGS = {"rays": 200, "duration_s": 0.25, "arrival_directions": 6, "yaws": 1, "sample_rate": 16_000}
+
+
+def level(openness: float = 1.0) -> LevelScene:
+    """Two rooms with a door between them, with few probes and rays."""
+    place = rooms()
+    moves = SceneDoor(**door(SWING, openness=openness), surface_mass_kg_m2=12.0)
+    file = LevelFile(
+        id="rooms",
+        name="Two rooms",
+        description="",
+        geometry=LevelGeometry(mesh="geometry.npz", materials={**place.materials, "wood": WOOD}, doors=(moves,)),
+        start={"listener": BEFORE, "emitter": BEHIND},
+        probes=APARTMENT.probes.model_copy(update={"spacing_m": 1.6, "wall_clearance_m": 0.3}),
+        simulation=APARTMENT.simulation.model_copy(update=SETTINGS),
+    )
+    return LevelScene(file, place.mesh, (leaf(),))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("rooms")
+    level().write(folder / "scene")
+    with open_jobs(None, threads=1) as jobs:
+        return simulate(folder / "scene", folder / "data", seed=3, jobs=jobs, progress=QUIET)
+
+
+@pytest.fixture(scope="module")
+def bundle(dataset, tmp_path_factory) -> Bundle:
+    folder = tmp_path_factory.mktemp("run")
+    configuration = configure("directional", rank=16, width=32, epochs=30)
+    assert train(SimulatedResponses(dataset), folder, configuration, QUIET)
+    return export(SimulatedResponses(dataset), [folder], folder / "bundle", checked=False)
+
+
+def emitter_with(dataset: Dataset, openness: float) -> int:
+    return int(np.argmin(np.abs(dataset.states.openness[:, 0] - openness)))
+
+
+class TestStates:
+    def test_they_are_the_same_for_the_same_seed_and_from_shut_to_open(self):
+        one, same, other = (DoorStates.of(level(), 100, seed) for seed in (1, 1, 2))
+        np.testing.assert_array_equal(one.openness, same.openness)
+        assert (one.openness != other.openness).any()
+        assert one.openness.min() == 0
+        assert one.openness.max() == 1
+        assert len(alike(one.openness)) > 12
+
+    @pytest.mark.parametrize("seed", range(20))
+    def test_no_emitter_that_is_trained_on_has_an_unseen_state(self, seed):
+        states = DoorStates.of(level(), 60, seed)
+        assert 0 < states.unseen.sum() < 20
+        seen = {share for (share,) in states.openness[~states.unseen].tolist()}
+        assert not seen & {share for (share,) in states.openness[states.unseen].tolist()}
+
+    def test_held_out_couples_are_so_in_both_directions_and_touch_what_is_unseen(self):
+        states = DoorStates.of(level(), 60, 0)
+        held_out = states.held_out(np.random.default_rng(0))
+        np.testing.assert_array_equal(held_out, held_out.T)
+        assert (states.unseen[:, None] | states.unseen)[held_out].all()
+        assert not held_out.diagonal().any()
+
+    def test_a_scene_without_doors_has_none(self):
+        still = replace(level(), doors=())
+        assert DoorStates.of(still, 5, 0).openness.shape == (5, 0)
+        assert not DoorStates.of(APARTMENT, 5, 0).unseen.any()
+
+
+def test_pairs_in_unseen_states_are_not_trained_on(dataset):
+    trained, held_out = dataset.trained, dataset.held_out
+    assert not (trained & held_out).any()
+    assert not trained[dataset.states.unseen].any()
+    assert held_out[dataset.states.unseen].any()
+    responses = SimulatedResponses(dataset)
+    learner = DirectionalLearner(responses, configure("directional", rank=16, width=32, epochs=1))
+    told = {share for (share,) in learner._openness.tolist()}
+    unseen = dataset.states.openness[dataset.states.unseen].astype(np.float32)
+    assert not told & {share for (share,) in unseen.tolist()}
+    assert len(learner._openness) == trained.sum()
+
+
+def test_energies_are_of_the_state_of_their_emitter(dataset):
+    """Through the door that is shut nothing arrives; each is what the tracer says of its state."""
+    for share in (0.0, 1.0):
+        emitter = emitter_with(dataset, share)
+        listeners = np.flatnonzero(dataset.trained[emitter])
+        stored = dataset.read_energy(np.column_stack([np.full(len(listeners), emitter), listeners])).sum(axis=(1, 2, 3))
+        state = level(float(dataset.states.openness[emitter, 0]))
+        tracer = RoomTracer.of(state, dataset.effects, dataset.probes[listeners], duration_s=0.25)
+        rng = np.random.default_rng([dataset.seed, 2, emitter, 0])
+        traced = tracer.energy(dataset.probes[emitter], rays=dataset.effects.rays, rng=rng).sum(axis=(1, 2, 3))
+        np.testing.assert_allclose(stored, traced, rtol=0.05)
+
+
+def test_direct_sound_and_onset_are_of_that_state(dataset):
+    shut, wide = emitter_with(dataset, 0.0), emitter_with(dataset, 1.0)
+    assert dataset.states.openness[shut, 0] == 0
+    for emitter in (shut, wide):
+        state = level(float(dataset.states.openness[emitter, 0]))
+        expected_s = state.path_length_m(dataset.probes[emitter], dataset.probes) / 343.0
+        np.testing.assert_allclose(dataset.onset_s[emitter], expected_s)
+        pairs = np.column_stack([np.full(len(dataset.probes), emitter), np.arange(len(dataset.probes))])
+        sees = state.surroundings.is_visible(dataset.probes[emitter], dataset.probes)
+        np.testing.assert_array_equal(dataset.is_visible(pairs), sees)
+
+
+def test_no_probe_is_where_the_leaf_passes(dataset):
+    for share in np.linspace(0, 1, 41):
+        tree = level(float(share)).surroundings.tree
+        assert tree.distance_m(dataset.probes).min() > 0.2
+
+
+def test_a_file_says_its_format_and_bad_openness_is_refused(dataset, tmp_path):
+    with h5py.File(dataset.folder / "pairs.h5") as file:
+        assert file.attrs["format"] == 6
+    copy = tmp_path / "data"
+    copy.mkdir()
+    for path in dataset.folder.iterdir():
+        if path.is_file():
+            (copy / path.name).write_bytes(path.read_bytes())
+    np.testing.assert_array_equal(Dataset.open(copy).states.openness, dataset.states.openness)
+    with h5py.File(copy / "pairs.h5", "r+") as file:
+        file["openness"][2, 0] = 1.5
+    with pytest.raises(DatasetError, match="openness: is not from 0 to 1"):
+        Dataset.open(copy)
+
+
+def test_a_bundle_has_leaves_that_move_and_a_field_that_knows_them(bundle, dataset):
+    assert [each.name for each in bundle.doors] == ["between"]
+    assert [field.doors for field in bundle.manifest.fields.values()] == [("between",)]
+    require_same_scene(bundle, dataset)
+
+
+def test_less_reverberation_comes_through_a_door_that_is_shut(bundle):
+    fields = FieldsByLevel.load(bundle)
+    ends = [(6.5, 1.2, 1.5)], [(1.5, 4.0, 1.5)]
+    levels_db = []
+    for share in (0.0, 1.0):
+        heard = fields.with_doors((share,)).default.impulse_responses(*ends, np.zeros(1))
+        assert np.isfinite(heard).all()
+        levels_db.append(power_to_db(np.sum(heard.astype(np.float64) ** 2) + 1e-12))
+    assert levels_db[0] < levels_db[1] - 6
+
+
+def test_errors_are_measured_in_the_state_of_each_pair(bundle, dataset):
+    """Direct sound and first reflections, which no field predicts, are those of the state."""
+    sample = SampledPairs(dataset, codec_of(SimulatedResponses(dataset)), pairs=6, yaws=1, seed=0)
+    estimate, references = Estimate(FieldsByLevel.load(bundle).default), References(dataset)
+    with open_held_out(dataset.folder) as held_out:
+        (column,) = field_columns([bundle], held_out)
+        for entry in sample.entries:
+            index = next(
+                index
+                for index in range(len(held_out))
+                if (held_out.emitters[index] == entry.emitter).all()
+                and (held_out.listeners[index] == entry.listener).all()
+            )
+            assert held_out.openness(index) == entry.openness
+            heard = estimate(entry)
+            np.testing.assert_allclose(column.source(index, np.array([0])), heard, atol=1e-6)
+            number = int(held_out.held_out[index])
+            if dataset.is_visible(np.array([divmod(number, len(dataset.probes))]))[0]:
+                direct = references.geometric(number)
+                peak = np.unravel_index(np.argmax(np.abs(direct)), direct.shape)
+                np.testing.assert_allclose(heard[peak], direct[peak], rtol=0.3)
+
+
+@pytest.mark.parametrize("kind", ["factorised", "naf"])
+def test_fields_that_are_not_told_of_doors_are_refused(dataset, kind, tmp_path):
+    with pytest.raises(RecipeError, match="not told of them: train directional"):
+        train(SimulatedResponses(dataset), tmp_path, configure(kind), QUIET)
