@@ -77,6 +77,8 @@ const acts = {
   move: (listener) => stream.moveListener(listener),
   remove: (id) => stream.removeListener(id),
   emitter: (emitter) => stream.setEmitter(emitter),
+  door: (door) => stream.setDoor(door),
+  level: (level) => stream.setLevel(level),
   pause,
   expire() {
     for (const limit of limits) {

@@ -14,6 +14,7 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   radio.gainDb = -6;
   nafir.addEmitter({ source: await microphone(context), position: [1, 2, 1.5], yaw: 0.5 });
   nafir.listener.yaw = 1;
+  for (const door of Object.keys(nafir.welcome?.doors ?? {})) nafir.setDoor(door, 0.5);
   nafir.listener.move({ position: [1, 1, 1.6], orientation: [0, 0, 0, 1] });
   nafir.addEventListener("refused", ({ detail }) => console.warn(detail.code, detail.message));
   nafir.addEventListener("state", ({ detail }) => console.log(detail.state, detail.retryMs ?? 0));
@@ -34,6 +35,8 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   nafir.addEmitter({ clip: "trumpet" });
   // @ts-expect-error  a scene is rendered here or by the server
   await connect(context, "", { scene: "apartment", rendered: "there" });
+  // @ts-expect-error  a door has a name, and is so far open
+  nafir.setDoor("front");
   // @ts-expect-error  a listener has no clip
   await nafir.addListener({ clip: "trumpet" });
   // @ts-expect-error  ambisonics end at order 3

@@ -1,4 +1,4 @@
-"""Several listeners in a stream of the package for JavaScript, in Node, without a server: what it says and tells."""
+"""What a stream of the package for JavaScript says and tells, in Node, without a server: listeners, doors, levels."""
 
 import json
 import shutil
@@ -16,7 +16,9 @@ from server.protocol.client_messages import (
     ListenerPose,
     RemoveListener,
     Resume,
+    SetDoor,
     SetGain,
+    SetLevel,
     parse_client_message,
 )
 from tests.clients.test_javascript import HERE, MODULES, NODE
@@ -274,3 +276,31 @@ def test_an_old_server_refuses_a_listener_without_naming_it(tmp_path):
     assert [each["left"]["id"] for each in refused[1] if "left" in each] == ["p3"]
     assert of(RemoveListener, refused) == [RemoveListener(id="p3")]
     assert [each["block"]["id"] for each in refused[1] if "block" in each] == ["p2"]
+
+
+WITH_DOORS = {**NEW, "doors": {"kitchen": 0.0}}
+
+
+def test_what_changes_while_a_hello_is_not_answered_is_said_after_its_welcome(tmp_path):
+    before = [["door", {"name": "kitchen", "openness": 0.25}], ["level", "standard"], ["open", None]]
+    while_waiting = [["door", {"name": "kitchen", "openness": share}] for share in (0.5, 0.75)] + [["level", "draft"]]
+    opened, waiting, welcomed = run(tmp_path, before, while_waiting, [["receive", WITH_DOORS], ["pause", SETTLED_MS]])
+    [hello] = of(Hello, opened)
+    assert (hello.doors, hello.level) == ({"kitchen": 0.25}, "standard")
+    assert waiting[0] == []
+    assert of(SetDoor, welcomed) == [SetDoor(door="kitchen", openness=0.75)]
+    assert of(SetLevel, welcomed) == [SetLevel(level="draft")]
+
+
+def test_a_door_that_the_scene_does_not_have_is_not_asked_for_again(tmp_path):
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
+    doors = [["door", {"name": name, "openness": 1.0}] for name in ("kitchen", "of another scene")]
+    _, asked, again = run(
+        tmp_path,
+        [["open", None], ["receive", WITH_DOORS]],
+        doors,
+        [*LOST, ["receive", forgotten], ["lose", 1008], ["open", None]],
+    )
+    assert [each.door for each in of(SetDoor, asked)] == ["kitchen", "of another scene"]
+    [hello] = of(Hello, again)
+    assert hello.doors == {"kitchen": 1.0}

@@ -1,5 +1,6 @@
 """What the Python client says is what the server reads, and the other way round. The package has no import of it."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -147,6 +148,16 @@ def test_a_new_connection_asks_for_what_the_last_one_had():
     assert isinstance(again, AddEmitter)
     assert (again.id, again.position, again.orientation, again.gain_db) == ("talker", (2, 2.5, 1), (0, 0, 1, 0), -6.0)
     assert session.outbox.take() is None
+
+
+def test_a_door_that_the_scene_does_not_have_is_not_asked_for_by_a_new_connection():
+    session = Session("flat", {})
+    session.greet(json.dumps({**json.loads(WELCOME), "doors": {"kitchen": 0.0}}), 0.0)
+    session.set_door("kitchen", 0.25)
+    session.set_door("of another scene", 1.0)
+    assert session.outbox.take() is not None
+    assert session.outbox.take() is not None
+    assert parse_client_message(session.first_message()).doors == {"kitchen": 0.25}
 
 
 def test_acknowledgements_keep_the_window_open():

@@ -66,7 +66,8 @@ class Scene:
 @dataclass(frozen=True)
 class Welcome:
     """What the server has agreed to for a stream. `window` is how many blocks of each listener may be
-    unacknowledged, and `max_listeners` how many listeners there may be, if that was asked."""
+    unacknowledged, and `max_listeners` how many listeners there may be, if that was asked. `doors` says how far each
+    door is open, from 0, shut, to 1."""
 
     scene: Scene
     sample_rate: int
@@ -80,6 +81,7 @@ class Welcome:
     level: str
     order: int | None
     max_listeners: int | None
+    doors: Mapping[str, float]
     given: Mapping[str, Any]
 
     @classmethod
@@ -99,6 +101,7 @@ class Welcome:
                 level=given["level"],
                 order=given.get("order"),
                 max_listeners=given.get("max_listeners"),
+                doors=given.get("doors", {}),
                 given=given,
             )
         except KeyError as exc:

@@ -420,7 +420,9 @@ class Session:
         self._put({"type": "set_level", "level": level})
 
     def set_door(self, door: str, openness: float) -> None:
-        self._hello["doors"] = {**self._hello.get("doors", {}), door: openness}
+        """A door that the scene does not have is an error of the server, and is not asked for by a new connection."""
+        if self.welcome is None or door in self.welcome.doors:
+            self._hello["doors"] = {**self._hello.get("doors", {}), door: openness}
         self._put({"type": "set_door", "door": door, "openness": openness}, ("door", door))
 
     def set_effects(self, effects: Mapping[str, bool | None], output: str | None) -> None:

@@ -436,7 +436,7 @@ class Stream:
         await self.change(lambda session: session.set_level(level))
 
     async def set_door(self, door: str, openness: float) -> None:
-        """Open a door of the scene so far, from 0, shut, to 1. The scene of the welcome has those there are."""
+        """Open a door of the scene so far, from 0, shut, to 1. `Welcome.doors` has those there are."""
         await self.change(lambda session: session.set_door(door, openness))
 
     async def set_effects(self, effects: Mapping[str, bool | None], *, output: str | None = None) -> None:

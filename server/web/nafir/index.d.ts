@@ -42,6 +42,8 @@ export interface Welcome {
   level: string;
   order?: number;
   max_emitters: number | null;
+  /** How far each door of the scene is open, from 0, shut, to 1. Scenes without doors do not have it. */
+  doors?: Record<string, number>;
   [more: string]: unknown;
 }
 
@@ -148,7 +150,7 @@ export interface Nafir extends EventTarget {
   removeListener(id: string): void;
   /** Chooses a quality level of the scene, or "auto". */
   set level(name: string);
-  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.scene.doors` has those there are. */
+  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.doors` has those there are. */
   setDoor(name: string, openness: number): void;
   /** Switches effects on or off by name; null leaves one to the server's plan. */
   setEffects(effects: Record<string, boolean | null>): void;

@@ -388,7 +388,7 @@ class Nafir extends EventTarget {
     this.#stream.tell("level", { name });
   }
 
-  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.scene.doors` has those there are. */
+  /** Opens a door of the scene so far, from 0, shut, to 1. `welcome.doors` has those there are. */
   setDoor(name, openness) {
     this.#stream.tell("door", { name, openness });
   }

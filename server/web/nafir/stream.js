@@ -63,6 +63,8 @@ export class Stream {
   #last = {}; // {sequence, sampleClock} of the last block
   #orders = []; // the newest messages that the server counts: {text, key, isSent}, and how many there were
   #ordered = 0;
+  #awaiting = new Map(); // key -> message that says what changed since the hello, for when the hello is answered
+  #doors = null; // names of the scene's doors, once a welcome has said them
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
@@ -195,13 +197,14 @@ export class Stream {
 
   setLevel(level) {
     this.#hello = { ...this.#hello, level };
-    if (this.#isOpen) this.#order(message.setLevel(level), "level");
+    this.#change(message.setLevel(level), "level");
   }
 
-  /** Opens a door of the scene so far, from 0, shut, to 1. */
+  /** Opens a door of the scene so far, from 0, shut, to 1. One that the scene does not have is an error of the server, and is not asked for
+      again. */
   setDoor({ name, openness }) {
-    this.#hello = { ...this.#hello, doors: { ...this.#hello.doors, [name]: openness } };
-    if (this.#isOpen) this.#order(message.setDoor({ name, openness }), `door ${name}`);
+    if (this.#doors?.has(name) ?? true) this.#hello = { ...this.#hello, doors: { ...this.#hello.doors, [name]: openness } };
+    this.#change(message.setDoor({ name, openness }), `door ${name}`);
   }
 
   /** Each of `effects` is on, off, or null to follow the plan; `output` is null to keep the present one. */
@@ -209,7 +212,7 @@ export class Stream {
     const wished = { ...this.#hello.effects, ...effects };
     for (const [name, isOn] of Object.entries(wished)) if (isOn === null) delete wished[name];
     this.#hello = { ...this.#hello, effects: wished, output: output ?? this.#hello.output };
-    if (this.#isOpen) this.#order(message.setEffects({ effects, output }));
+    this.#change(message.setEffects({ effects, output }));
   }
 
   /** Begins a new stream, since only a hello says what `changes` say: the head, or the channels of the output. */
@@ -296,6 +299,12 @@ export class Stream {
     return this.#welcomed || this.#token !== null;
   }
 
+  /** Sends a message that changes what the hello says too. While a hello is not answered yet, the message waits. */
+  #change(text, key = null) {
+    if (this.#isOpen) this.#order(text, key);
+    else this.#awaiting.set(key ?? text, text);
+  }
+
   /** Sends a message that changes the stream, now or when it is resumed. One that waits for that gives way to a newer one with its key. */
   #order(text, key = null) {
     const older = key === null ? -1 : this.#orders.findIndex((order) => order.key === key && !order.isSent);
@@ -347,6 +356,7 @@ export class Stream {
         socket.send(message.resume({ token: this.#token, ...this.#last }));
         return;
       }
+      this.#awaiting.clear(); // the hello says it
       const { at, ...listener } = this.#listener;
       const listeners = Math.max(this.#hello.listeners ?? 0, this.#others.size && 1 + this.#others.size) || undefined;
       socket.send(message.hello({ ...this.#hello, listener, emitters: this.#emitters.size, listeners }));
@@ -457,12 +467,15 @@ export class Stream {
     this.#token = welcome.resume_token ?? null;
     this.#resumeMs = 1000 * (welcome.resume_s ?? 0);
     this.#lostAt = null;
+    this.#doors = new Set(Object.keys(welcome.doors ?? {}));
     this.#listeners.state({ state: "live", welcome });
     if (welcome.resumed) {
       this.#goOn(welcome.resumed);
     } else {
       for (const id of this.#others.keys()) this.#askFor(id); // before what they are to hear from its beginning
       for (const emitter of this.#emitters.values()) this.#add(emitter);
+      for (const [key, text] of this.#awaiting) this.#order(text, key);
+      this.#awaiting.clear();
     }
     // Everything that moved between hello and welcome is in here.
     this.setListener({ ...this.#listener, at: now() });
