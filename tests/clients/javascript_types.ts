@@ -4,7 +4,7 @@ import * as THREE from "three";
 import { connect, microphone, RefusedError, type Emitter, type Latency, type Listener } from "nafir-client";
 import { Field, type Channels } from "nafir-client/field";
 import { bind, poseOf } from "nafir-client/three";
-import { useEmitter, useNafir } from "nafir-client/react";
+import { useDoor, useEmitter, useListener, useNafir } from "nafir-client/react";
 
 export async function listen(context: AudioContext): Promise<Latency | null> {
   const nafir = await connect(context, "https://sound.example", { scene: "apartment", order: 1, signal: AbortSignal.timeout(5000) });
@@ -47,6 +47,8 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
 export function Hook(): string {
   const { nafir, state, error, start } = useNafir("/", { scene: "apartment" });
   const emitter = useEmitter(nafir, { clip: "trumpet", position: [1, 2, 3] });
+  const { listener, error: problem } = useListener(nafir, { position: [1, 2, 1.5], head: "kemar" });
+  useDoor(nafir, "kitchen", listener && !problem ? 1 : 0);
   void start();
   return error instanceof RefusedError ? `${error.code}` : `${state} ${emitter?.id} ${poseOf(new THREE.Object3D()).position[0]}`;
 }

@@ -6,6 +6,7 @@ import http.server
 import shutil
 import subprocess
 import threading
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from server.field.fields_by_level import FieldsByLevel
 from server.protocol.codecs import libopus
+from server.streaming.doors import FollowedDoors
 from tests import visitor
+from tests.serving import serving
+from tests.two_rooms import write_two_rooms
 
 browser = visitor.browser
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
@@ -300,9 +305,9 @@ def visitor_of(browser, examples) -> Iterator:
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
 
-    def open_example(name: str):
+    def open_example(name: str, **asked: str):
         origin, server = examples
-        page.goto(f"{origin}/{name}?server={server}")
+        page.goto(f"{origin}/{name}?{urllib.parse.urlencode({'server': server, **asked})}")
         return page
 
     yield open_example
@@ -330,12 +335,16 @@ def test_the_example_of_three_js_hears_what_it_shows(visitor_of):
     assert np.linalg.norm(np.subtract(ball, cube)) < 1.2
 
 
-@needs_packages
-def test_the_example_of_react_adds_and_removes_what_it_renders(visitor_of):
+def bundle_react() -> None:
     command = ["react.jsx", "--bundle", "--format=esm", "--jsx=automatic", "--outfile=react.bundle.js"]
     subprocess.run(
         [PACKAGE / "node_modules" / ".bin" / "esbuild", *command], cwd=PACKAGE, check=True, capture_output=True
     )
+
+
+@needs_packages
+def test_the_example_of_react_adds_and_removes_what_it_renders(visitor_of):
+    bundle_react()
     page = visitor_of("react.html")
     page.click("#start")
     page.wait_for_function("document.getElementById('state').textContent === 'live'")
@@ -354,6 +363,48 @@ def test_the_example_of_react_adds_and_removes_what_it_renders(visitor_of):
     page.wait_for_function("document.getElementById('state').textContent === 'closed'")
     page.wait_for_timeout(200)
     assert page.workers == []
+
+
+@needs_packages
+def test_a_component_of_react_listens_as_long_as_it_is_there(visitor_of):
+    bundle_react()
+    page = visitor_of("react.html")
+    page.click("#start")
+    page.wait_for_function("document.getElementById('state').textContent === 'live'")
+    for x in ("3", "4"):
+        page.check("#watched")
+        page.wait_for_function("window.spectator")
+        page.fill("#x", x)
+        assert page.evaluate("spectator.position") == [float(x), 2, 1.5]
+        page.wait_for_function("spectator.latency.direct")
+        page.uncheck("#watched")
+        assert page.evaluate("nafir.listeners.size") == 0
+    # One that is taken away before it is there leaves its id to the next.
+    page.evaluate("for (let i = 0; i < 3; i++) document.getElementById('watched').click()")
+    page.wait_for_function("window.spectator")
+    assert page.inner_text("#spectator") == "Another listener at 4 m"
+    page.evaluate("spectator.remove()")
+
+
+@needs_packages
+def test_a_component_of_react_opens_doors(visitor_of, examples, tmp_path, hrtfs, monkeypatch):
+    bundle_react()
+    moved = []
+    set_door = FollowedDoors.set
+    monkeypatch.setattr(FollowedDoors, "set", lambda self, *door: (moved.append(door), set_door(self, *door)))
+    levels = FieldsByLevel.load(write_two_rooms(tmp_path / "scene", openness=0.0))
+    with serving(levels, hrtfs, allowed_origins=(examples[0],)) as address:
+        page = visitor_of("react.html", server=f"http://{address}", scene=levels.bundle.id)
+        page.click("#start")
+        page.wait_for_function("document.getElementById('state').textContent === 'live'")
+        page.get_by_label("between").fill("0.5")
+        for _ in range(100):
+            if ("between", 0.5) in moved:
+                break
+            page.wait_for_timeout(50)
+        assert moved[-1] == ("between", 0.5)
+        page.click("#start")
+        page.wait_for_function("document.getElementById('state').textContent === 'closed'")
 
 
 _CONNECT_HERE = _CONNECT.replace("48000", "24000")

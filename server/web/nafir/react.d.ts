@@ -1,4 +1,4 @@
-import type { ConnectOptions, Emitter, EmitterOptions, Nafir, State } from "./index.js";
+import type { ConnectOptions, Emitter, EmitterOptions, Listener, ListenerOptions, Nafir, State } from "./index.js";
 
 export interface NafirHook {
   nafir: Nafir | null;
@@ -11,3 +11,5 @@ export interface NafirHook {
 
 export function useNafir(url: string | URL, options: Omit<ConnectOptions, "signal"> & { context?: AudioContext }): NafirHook;
 export function useEmitter(nafir: Nafir | null, options: EmitterOptions): Emitter | null;
+export function useListener(nafir: Nafir | null, options?: ListenerOptions): { listener: Listener | null; error: Error | null };
+export function useDoor(nafir: Nafir | null, name: string, openness: number): void;

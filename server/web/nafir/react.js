@@ -6,7 +6,7 @@
 
 import { useCallback, useEffect, useRef, useState } from "react";
 
-import { connect } from "./index.js";
+import { RefusedError, connect } from "./index.js";
 
 /**
  * A stream that begins with `start`, which has to be called by a click or a key: browsers allow sound only then. `nafir` is what `connect`
@@ -90,4 +90,51 @@ export function useEmitter(nafir, { position, orientation, yaw, gainDb = 0, clip
     if (emitter && emitter.gainDb !== gainDb) emitter.gainDb = gainDb;
   }, [emitter, gainDb]);
   return emitter;
+}
+
+/** A listener beside the first, as long as the component is there. Options are those of `addListener`; position and direction may change with
+    every render, and with another id or head it is another listener. Returns `listener`, which is null before it is there and when it is gone,
+    and `error`, which says why it is not there, or is null. */
+export function useListener(nafir, { position, orientation, yaw, ...fixed } = {}) {
+  const [there, setThere] = useState({ listener: null, error: null });
+  const first = useRef();
+  const turned = orientation ? { orientation } : yaw === undefined ? {} : { yaw };
+  const pose = { ...(position ? { position } : {}), ...turned };
+  first.current = { ...fixed, ...pose };
+  const { id, head } = fixed;
+
+  useEffect(() => {
+    if (!nafir) return undefined;
+    let isWanted = true;
+    let added = null;
+    const tell = (listener, error) => isWanted && setThere({ listener, error });
+    const left = ({ detail }) => {
+      if (detail.id === added?.id) tell(null, new RefusedError(detail.message, detail.code, detail.id));
+    };
+    const isNew = id !== undefined && !nafir.listeners.has(id); // else it belongs to somebody else
+    const entered = (listener) => {
+      added = listener;
+      if (isWanted) tell(listener, null);
+      else listener.remove();
+    };
+    nafir.addEventListener("left", left);
+    nafir.addListener(first.current).then(entered, (error) => tell(null, error));
+    return () => {
+      isWanted = false;
+      nafir.removeEventListener("left", left);
+      if (added) added.remove();
+      else if (isNew) nafir.removeListener(id); // so that the id is free at once
+      setThere({ listener: null, error: null });
+    };
+  }, [nafir, id, head]);
+
+  useEffect(() => {
+    there.listener?.move(pose);
+  }, [there.listener, JSON.stringify(pose)]);
+  return there;
+}
+
+/** Holds a door of the scene so far open, from 0, shut, to 1. It stays as it is when the component goes. */
+export function useDoor(nafir, name, openness) {
+  useEffect(() => nafir?.setDoor(name, openness), [nafir, name, openness]);
 }
