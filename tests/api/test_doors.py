@@ -17,6 +17,7 @@ from server.protocol.blocks import AudioBlock
 from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetDoor
 from server.protocol.packets import BlockReader
 from server.protocol.server_messages import EmitterAdded, Error, Welcome, parse_server_message
+from tests.api.test_listeners_of_a_stream import lose
 from tests.two_rooms import BEFORE, BEHIND, EAST, WEST, write_two_rooms
 
 PLACES = {"listener": ",".join(map(str, WEST)), "emitter": ",".join(map(str, EAST))}
@@ -170,14 +171,10 @@ def test_a_stream_begins_and_is_resumed_with_doors_as_they_were(client):
         visitor.send(SetDoor(door="between", openness=0.25))
         visitor.until(AudioBlock)
         token = visitor.welcome.resume_token
-        socket.close(4_000)  # no goodbye
+        lose(socket, client)
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_text(json.dumps({"type": "resume", "protocol": PROTOCOL, "token": token}))
-        for _ in range(100):
-            received = socket.receive()
-            message = parse_server_message(received["text"]) if received.get("text") else None
-            if isinstance(message, Welcome):
-                break
+        message = parse_server_message(socket.receive_text())
         assert message.resumed is not None
         assert message.doors == {"between": 0.25}
 
