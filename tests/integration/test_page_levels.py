@@ -122,6 +122,7 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     start(page)
     page.select_option("#turning", "server")
     page.wait_for_function("nafir.state().output === 'headphones' && nafir.state().latency !== null")
+    page.wait_for_function("nafir.state().connection === 'live'")
     page.evaluate(FOLLOW_CONNECTION)
     page.select_option("#level-choice", "in-this-browser")
     page.wait_for_function("nafir.state().level === 'in-this-browser'")

@@ -61,6 +61,7 @@ def test_pairs_at_nodes_do_not_make_a_lattice_seem_exact(exact, reusing) -> None
         samples=exact.ir_samples,
         channels=exact.channels,
         filters=None,
+        openness=lambda _: None,
     )
     anew, moved = field_source(exact, held_out), field_source(reusing, held_out)
     for pair in range(len(found)):

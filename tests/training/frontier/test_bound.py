@@ -29,6 +29,11 @@ def test_true_magnitudes_at_the_true_phase_are_the_reference(direct_sound):
         spectrograms=lambda *_: SimpleNamespace(log_magnitude=magnitudes),
     )
     entry = SimpleNamespace(
-        yaws=np.zeros(1), listener=np.zeros(3), emitter=np.ones(3), reference=reflected + added, reflected=reflected
+        yaws=np.zeros(1),
+        listener=np.zeros(3),
+        emitter=np.ones(3),
+        openness=None,
+        reference=reflected + added,
+        reflected=reflected,
     )
     np.testing.assert_allclose(TruePhase(field)(entry)[..., :900], (reflected + added)[..., :900], atol=1e-3)
