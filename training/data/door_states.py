@@ -78,9 +78,10 @@ class EmitterScenes:
         if not len(openness):
             return self.scene
         assert isinstance(self.scene, LevelScene)
-        return self._by_state.setdefault(
-            openness.astype(np.float64).tobytes(), self.scene.with_doors(openness.tolist())
-        )
+        state = openness.astype(np.float64).tobytes()
+        if state not in self._by_state:
+            self._by_state.setdefault(state, self.scene.with_doors(openness.tolist()))
+        return self._by_state[state]
 
     def groups(self, emitters: npt.NDArray[np.integer]) -> Mapping[int, npt.NDArray[np.int64]]:
         """Where in `emitters` (n,) those of each state are, by one emitter of that state."""
