@@ -37,9 +37,9 @@ SETTINGS = {"rays": 200, "duration_s": 0.25, "arrival_directions": 6, "yaws": 1,
 
 
 def level(openness: float = 1.0) -> LevelScene:
-    """Two rooms with a door between them, with few probes and rays."""
+    """Two rooms with a heavy door between them, with few probes and rays."""
     place = rooms()
-    moves = SceneDoor(**door(SWING, openness=openness), surface_mass_kg_m2=12.0)
+    moves = SceneDoor(**door(SWING, openness=openness), surface_mass_kg_m2=120.0)
     file = LevelFile(
         id="rooms",
         name="Two rooms",
@@ -115,16 +115,16 @@ def test_pairs_in_unseen_states_are_not_trained_on(dataset):
 
 
 def test_energies_are_of_the_state_of_their_emitter(dataset):
-    """Each is what the tracer says of its state. Which rays go on through walls hangs on rounding, hence a tenth."""
+    """Each is what the tracer says of its state, to the precision in which it is stored."""
     for share in (0.0, 1.0):
         emitter = emitter_with(dataset, share)
-        listeners = np.flatnonzero(dataset.trained[emitter])
+        listeners = np.flatnonzero(dataset.trained[emitter] | dataset.held_out[emitter])
         stored = dataset.read_energy(np.column_stack([np.full(len(listeners), emitter), listeners])).sum(axis=(1, 2, 3))
         state = level(float(dataset.states.openness[emitter, 0]))
         tracer = RoomTracer.of(state, dataset.effects, dataset.probes[listeners], duration_s=0.25)
         rng = np.random.default_rng([dataset.seed, 2, emitter, 0])
         traced = tracer.energy(dataset.probes[emitter], rays=dataset.effects.rays, rng=rng).sum(axis=(1, 2, 3))
-        np.testing.assert_allclose(stored, traced, rtol=0.1)
+        np.testing.assert_allclose(stored, traced, rtol=1e-3)
 
 
 def test_direct_sound_and_onset_are_of_that_state(dataset):
@@ -166,7 +166,6 @@ def test_a_bundle_has_leaves_that_move_and_a_field_that_knows_them(bundle, datas
     require_same_scene(bundle, dataset)
 
 
-@pytest.mark.long
 def test_less_reverberation_comes_through_a_door_that_is_shut(bundle):
     fields = FieldsByLevel.load(bundle)
     ends = [(6.5, 1.2, 1.5)], [(1.5, 4.0, 1.5)]
@@ -175,10 +174,9 @@ def test_less_reverberation_comes_through_a_door_that_is_shut(bundle):
         heard = fields.with_doors((share,)).default.impulse_responses(*ends, np.zeros(1))
         assert np.isfinite(heard).all()
         levels_db.append(power_to_db(np.sum(heard.astype(np.float64) ** 2) + 1e-12))
-    assert levels_db[0] < levels_db[1] - 3
+    assert levels_db[0] < levels_db[1] - 6
 
 
-@pytest.mark.long
 def test_errors_are_measured_in_the_state_of_each_pair(bundle, dataset):
     """Direct sound and first reflections, which no field predicts, are those of the state."""
     sample = SampledPairs(dataset, codec_of(SimulatedResponses(dataset)), pairs=6, yaws=1, seed=0)
