@@ -14,10 +14,10 @@ from server.api.settings import Settings
 from server.cli.main import app
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.blocks import AudioBlock
-from server.protocol.client_messages import PROTOCOL, Acknowledge, AddEmitter, Hello, ListenerPose, SetDoor
-from server.protocol.packets import BlockReader
-from server.protocol.server_messages import EmitterAdded, Error, Welcome, parse_server_message
+from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, ListenerPose, SetDoor
+from server.protocol.server_messages import EmitterAdded, Error, parse_server_message
 from tests.api.test_listeners_of_a_stream import lose
+from tests.api.test_stream import Ears
 from tests.two_rooms import BEFORE, BEHIND, EAST, WEST, write_two_rooms
 
 PLACES = {"listener": ",".join(map(str, WEST)), "emitter": ",".join(map(str, EAST))}
@@ -110,29 +110,9 @@ def test_a_description_has_its_doors(client):
     assert (door["name"], door["openness"]) == ("between", 1.0)
 
 
-class Visitor:
+class Visitor(Ears):
     def __init__(self, socket, **hello):
-        self.socket = socket
-        self.send(Hello(protocol=PROTOCOL, scene="two-rooms", **hello))
-        self.welcome = self.until(Welcome)
-        self.reader = BlockReader(self.welcome)
-
-    def send(self, message):
-        self.socket.send_text(message if isinstance(message, str) else message.serialize())
-
-    def receive(self):
-        message = self.socket.receive()
-        if message.get("text") is not None:
-            return parse_server_message(message["text"])
-        block = self.reader.read(message["bytes"])
-        self.send(Acknowledge(sequence=block.sequence))
-        return block
-
-    def until(self, kind):
-        for _ in range(2_000):
-            if isinstance(message := self.receive(), kind):
-                return message
-        raise AssertionError(f"no {kind.__name__} came")
+        super().__init__(socket, Hello(protocol=PROTOCOL, scene="two-rooms", **hello))
 
     def level_db(self, blocks=20):
         heard = np.concatenate([self.until(AudioBlock).samples for _ in range(blocks)], axis=1)
