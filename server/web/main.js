@@ -180,6 +180,7 @@ class Page {
     if (clips.length === 0) this.notices.show("clips", "The server has no clip to play.", { lasting: true });
     this.paper = new Paper(find("paper"), scene);
     this.plan = new FloorPlan({ svg: find("marks"), paper: this.paper, world: this.world });
+    find("door-hint").hidden = this.world.doors.size === 0;
     new Storeys(find("storey-choice"), this.world, (storey) => this.#showStorey(storey));
     this.sources = new Sources({ world: this.world, clips, list: find("sources"), add: find("add-source"), limit: find("source-limit") });
     new Walking(this.world, { focusedEmitter: () => this.plan.focusedEmitter, dropped: () => this.map() });

@@ -53,6 +53,7 @@ def visit(browser, url):
 
 def test_a_door_is_opened_and_shut_by_click_drag_and_keyboard(visit):
     page, door = visit.page, visit.door()
+    assert page.locator("#door-hint").is_visible()
     assert (door.get_attribute("role"), door.get_attribute("aria-valuetext")) == ("slider", "shut")
     assert visit.maps()[-1]["door"] == ["between=0"]
     door.locator(".leaf").click(force=True)
@@ -75,6 +76,12 @@ def test_a_door_is_opened_and_shut_by_click_drag_and_keyboard(visit):
     page.mouse.move(hinge[0] - 0.57 * length, hinge[1] - 0.57 * length, steps=5)
     page.mouse.up()
     assert visit.openness() == pytest.approx(50, abs=4)
+
+
+def test_a_scene_without_doors_does_not_speak_of_them(browser, server):
+    context = browser.new_context()
+    assert not open_page(context, server).locator("#door-hint").is_visible()
+    context.close()
 
 
 def level_db(page):
