@@ -97,7 +97,7 @@ class MeshWithDoors:
 
     @cached_property
     def tree(self) -> MeshTree:
-        """Of the mesh without leaves."""
+        """The tree of the mesh without the leaves of doors."""
         return MeshTree(self.still)
 
     @cached_property

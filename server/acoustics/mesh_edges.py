@@ -452,7 +452,8 @@ def _joined(place: _Floats, sides: _Integers, along: _Floats, extent: _Floats) -
 
 
 def _cells(tree: MeshTree, lifted: _Floats, steps: npt.NDArray[np.float32]) -> _Cells:
-    """What is seen from a cell is what is seen from its corners, its middle, or a point in it."""
+    """Divide space into cells. Each has the points of `lifted` that are seen from its corners, from its middle or from
+    a point in it. One more cell at the end has all points."""
     if not len(lifted):
         return _Cells(np.zeros(3), np.ones(3), np.ones(3, np.int64), np.zeros(3, np.int64), np.zeros(0, np.int32))
     low, high = tree.mesh.bounds_m

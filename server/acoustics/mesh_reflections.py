@@ -70,9 +70,9 @@ class MeshWallLosses:
     losses_db: _Floats
 
     def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
-        """As of `server.acoustics.transmission.WallLosses`. A wall counts once, with the material of the side that
-        takes more: a wall is at least as heavy as it is said to be from either side, and a light lining on it takes
-        nothing from its mass. So it takes the same from both sides."""
+        """As `server.acoustics.transmission.WallLosses` says. A wall counts once, with the material of the side that
+        takes more: it is at least as heavy as either side says, and a light lining takes nothing from its mass. So the
+        loss is the same in both directions."""
         walls = self.tree.walls_between(np.asarray(listener, np.float64), np.asarray(emitters, np.float64))
         surfaces = self.tree.mesh.surfaces
         losses_db = np.array([self.losses_db[surfaces[each]].max(axis=1).sum(axis=0) for each in walls]).reshape(

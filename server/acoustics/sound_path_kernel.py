@@ -103,8 +103,13 @@ def _reach_bends(
     to_bend: Floats,
     first: Numbers,
 ) -> None:
-    """Write lengths in plan from the listener: to each visible corner, and to each corner by the shortest path over
-    others; `first` is the first corner of this path."""
+    """Fill the last three arrays, one value for each of the corners `bends` (bend, 2). All lengths are in plan, metres.
+
+    `from_listener` is the straight distance; it is infinite for a corner that the listener does not see or stands at.
+    `to_bend` is the length of the shortest path, which may bend at other corners on the way, and is infinite without
+    one. `first` is the number of the first corner of that path. `bend_lengths_m` (bend, bend) are the lengths of the
+    shortest paths between corners.
+    """
     count = len(bends)
     for bend in range(count):
         x, y = bends[bend]
@@ -229,7 +234,8 @@ def _is_elsewhere(one: Floats, other: Floats) -> bool:
 
 @compiled
 def _point(start: Floats, end: Floats, direction: Float32) -> None:
-    """Write the unit vector in plan from `start` to `end`; within a millimetre it shrinks to nothing."""
+    """Write the unit vector in plan from `start` to `end`. Where these are closer than about a millimetre, it is
+    shorter than one, down to zero where they coincide."""
     x, y = end[0] - start[0], end[1] - start[1]
     scale = 1.0 / (math.hypot(x, y) + SOFTENED_M)
     direction[0], direction[1] = x * scale, y * scale

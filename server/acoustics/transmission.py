@@ -77,7 +77,7 @@ class PlanWallLosses:
     wall_loss_db: _Floats
 
     def between(self, listener: npt.ArrayLike, emitters: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], _Floats]:
-        """As of `WallLosses`."""
+        """As `WallLosses.between` says."""
         walls = walls_between(self.plan, np.asarray(listener), np.asarray(emitters))
         return walls > 0, walls[:, None] * self.wall_loss_db
 

@@ -65,7 +65,7 @@ def _no_allowance(_: Allowance) -> None:
 
 
 def _no_charge(_: float) -> None:
-    """The same of `FastPath.charge`."""
+    """The default of `FastPath.charge`, for servers without budgets."""
 
 
 @dataclass(frozen=True)

@@ -119,8 +119,8 @@ class Run(_Form):
 
 
 class Measured(_Form):
-    """Runs of one scene on one machine: what `nafir bench costs` writes. `usable_share` is the share of a core that a
-    server gets that is asked for more."""
+    """Runs of one scene on one machine: what `nafir bench costs` writes. `usable_share` is the largest share of
+    a core that the server got; some of the runs asked for more than it could get."""
 
     format: Literal[1] = 1
     processor: str
@@ -195,7 +195,7 @@ class Demand:
     thresholds: Thresholds = THRESHOLDS
 
     def rates(self) -> dict[Driver, float]:
-        """The drivers per second, but plans and checks as often as they are asked for."""
+        """The drivers per second. Plans and checks count as often as they are asked for, whatever their limits are."""
         blocks = self.listeners * self.blocks_per_s
         groups = blocks / self.blocks_at_once
         # With the most blocks at once, the instants of a block are rendered together.
@@ -249,7 +249,8 @@ def load(costs: Costs, demand: Demand) -> Load:
 
 @dataclass(frozen=True)
 class Model:
-    """The costs of one machine's core, in one scene."""
+    """What listeners of one scene cost a core of one machine, and how often they ask for responses, plans and checks of
+    plans."""
 
     costs: Costs
     memory: Memory

@@ -135,7 +135,7 @@ class _Counts:
 
     @property
     def times(self) -> list[StreamTimes]:
-        """Those of all listeners."""
+        """The times of each listener of the stream."""
         return [member.times for member in self.stream.audience.members]
 
     @property

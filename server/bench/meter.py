@@ -68,7 +68,8 @@ class Spent:
 
 
 class _Local(threading.local):
-    """Of one thread: the seconds that measured functions took within each function that is running."""
+    """The state of one thread. For each measured function that is running, it has the seconds that measured functions
+    within it took."""
 
     def __init__(self) -> None:
         self.inner_s: list[float] = []

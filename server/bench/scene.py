@@ -100,7 +100,7 @@ class BankField(AcousticField):
     def first_samples(
         self, listeners: npt.ArrayLike, emitters: npt.ArrayLike, heads: npt.ArrayLike, samples: int
     ) -> FloatArray:
-        """As of `AcousticField`."""
+        """As `AcousticField.first_samples` does."""
         entry = self._entries(listeners, emitters, heads)
         return np.ascontiguousarray(self._bank[entry, :, :samples])
 

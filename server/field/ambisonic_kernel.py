@@ -68,7 +68,8 @@ def find_first_order(directions: Float32, moments: Float32, mixing: Float32) -> 
 
 @compiled
 def _smoothest(moments) -> None:
-    """Write the second moments that belong to the first ones."""
+    """Write the second-order harmonics, rows 3 to 7, of the smoothest sound that has the first-order harmonics of
+    rows 0 to 2 (y, z, x)."""
     for column in range(moments.shape[1]):
         y, z, x = moments[0, column], moments[1, column], moments[2, column]
         square = min(np.float32(1.0), x * x + y * y + z * z)
@@ -85,8 +86,9 @@ def _smoothest(moments) -> None:
 
 @compiled
 def _find_root(moments, column) -> None:
-    """Replace eight columns of the moments: by the shares of W's noise in Y, Z and X, and the root (yy, yz, yx, zz, zx,
-    xx) for their own noises."""
+    """Replace eight columns of the moments. Rows 0 to 2 become the shares of W's noise in Y, Z and X. Rows 3 to 8
+    become the elements yy, yz, yx, zz, zx and xx of the symmetric root that mixes the noises of these three
+    channels."""
     at, row = moments.ctypes.data, moments.shape[1]
     zero, one, half = broadcast(np.float32(0.0)), broadcast(np.float32(1.0)), broadcast(np.float32(0.5))
     tiny, third = broadcast(_TINY), broadcast(_ROOT_THIRD)
@@ -151,7 +153,11 @@ def _find_root(moments, column) -> None:
 
 @compiled
 def _angle(one, other, between):
-    """Tangent, cosine and sine of the smaller angle by which Jacobi's method turns a pair of axes."""
+    """The tangent, cosine and sine of one rotation in Jacobi's method for the eigenvalues of a symmetric matrix.
+
+    The rotation turns two axes so that the element `between` them becomes zero; `one` and `other` are their elements on
+    the diagonal. Of the two angles that do so, it is the smaller, at most 45 degrees.
+    """
     zero, unit = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     apart, twice = subtract(other, one), add(between, between)
     size = at_least(apart, subtract(zero, apart))
@@ -189,9 +195,9 @@ def mix_bands(
 
     `log_magnitude` (band, column) is what an ideal omnidirectional microphone hears, and `mixing` (k, noise, band,
     column) makes channels of unit power from the `noises` (noise, band, sample), whose units are `steps` (noise, band).
-    It is multiplied by the magnitudes. Values hold at the samples `places` (column,), and are interpolated between
-    them. The first one rises from nothing at sample `begin`, as it does where the windows of a first frame overlap with
-    none before.
+    `mixing` is overwritten with the gains of the noises. Gains hold at the samples `places` (column,), and are
+    interpolated between them. Before the first place, they rise from zero at sample `begin`, as the level does in a
+    first frame, whose window overlaps with none before it.
     """
     channels, bands, columns = response.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
     for column in range(columns):
@@ -237,7 +243,7 @@ def _magnitude(log_magnitude, log_floor):
 
 @compiled
 def _add(first, slope, noise, out, at, stop) -> None:
-    """Add samples `at` to `stop` of a noise with a gain that begins with `first`."""
+    """Add samples `at` to `stop` of a noise, with a gain that begins with `first` and changes by `slope` per sample."""
     source, to, count = noise.ctypes.data + 2 * at, out.ctypes.data + 4 * at, stop - at
     vectors = count // LANES * LANES
     gain, step = multiply_add(load(_RAMP.ctypes.data, 0), broadcast(slope), broadcast(first)), broadcast(slope * LANES)

@@ -37,9 +37,9 @@ def find_band_gains(
     at the left ear, of the left noise at the right ear, and of the right noise there.
 
     `products` (band, product, k) are those of the turned head, averaged over each band. `diffuse` (band, 3) are the
-    band's powers at both ears and the coherence of its noises, in diffuse sound of unit power: the noises are that
-    sound. Gains are in units of `steps` (band, left or right), those of the noises. Where directions cancel, an ear's
-    power is `least` times the diffuse one.
+    band's powers at both ears, and the coherence between them, in diffuse sound of unit power, which is what the noises
+    are. Gains are in units of `steps` (band, left or right), the units of the noises. Where directions cancel, an ear's
+    power is `least` times that of diffuse sound.
     """
     bands, columns = log_magnitude.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -77,10 +77,12 @@ def find_band_gains(
 
 @compiled
 def balance(before: np.float32, gain: np.float32, after: np.float32) -> np.float32:
-    """The factor by which a band's gain makes up for what is lacking between bands.
+    """The factor for the gain of a band by which its power is right, given the gains of the bands `before` and `after`
+    it.
 
-    There the bands' amplitudes add up, and not their powers. Over the octave between bands with gains g and h, this
-    gives (g^2 + g h + h^2) / 3 in place of (g^2 + h^2) / 2.
+    Neighbouring bands overlap and are parts of one noise, so their amplitudes add up, and not their powers. Over the
+    octave between two bands with gains g and h, the mean power is (g^2 + g h + h^2) / 3 where it should be
+    (g^2 + h^2) / 2. The squared factor is the mean, over the octaves on both sides, of the second over the first.
     """
     return np.sqrt(np.float32(0.5) * (_lacking(before, gain) + _lacking(gain, after)))
 
@@ -105,11 +107,13 @@ def add_band_tail(
     scratch: Float32,
     response: Float32,
 ) -> None:
-    """Add the noises with these gains, which hold at the samples `places` (column,) and are interpolated between them.
+    """Add `noises` times `gains` to a response. Gains hold at the samples `places` (column,), and are interpolated
+    between them.
 
-    The tail begins at sample `fade_at`, where the first frame is `missing` from the response; `missing` (2, sample) is
-    the missing amplitude from there on, if that frame is there and if it is not. A `share` of it is there, since levels
-    are delayed by parts of a frame. Where all frames are missing, the response must be silent. `scratch` (2, sample) is
+    The tail fades in from sample `fade_at` on, where the first frame begins that was not decoded. `missing` (2, sample)
+    is the amplitude that decoded sound lacks from there on: without the frames after that one, and without that one
+    too. If the response is delayed by part of a frame, a `share` of that frame is in it, and the tail is between both
+    rows. After `missing`, no sound was decoded, so the response must be silent there. `scratch` (2, sample) is
     overwritten.
     """
     end = min(response.shape[1], noises.shape[2])

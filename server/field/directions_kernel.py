@@ -56,8 +56,8 @@ class Turning(NamedTuple):
 
 @compiled
 def turn_products(turning: Turning, orientation: Floats, turned: Float32) -> None:
-    """Write the products (row * k,) for harmonics in world axes, of a head with this orientation, and TURNED_SCRATCH
-    numbers after them."""
+    """Write to `turned` the products (row * k,) of a head with this orientation, for harmonics in world axes. The next
+    TURNED_SCRATCH numbers of `turned` are overwritten, too."""
     level = turning.level
     harmonics = level.shape[1]
     matrix = np.zeros((harmonics, _PADDED), np.float32)
@@ -176,7 +176,8 @@ def ears_of_directions(
 
 @compiled
 def _find_powers(log_magnitude, directions, columns, floor, zero, work) -> None:
-    """Write the powers (k, band, column) of the first columns to `work`; whole vectors are filled up with silence."""
+    """Fill `work` (k, band, column) with the arriving powers of the first `columns` columns: first (k = 0) the power
+    itself, then its product with each of the `directions`. The other columns of the last whole vector become zero."""
     whole = work.shape[2]
     for number in range(log_magnitude.shape[0]):
         power = work[0, number]

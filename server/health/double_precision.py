@@ -55,7 +55,7 @@ class DoubleDecoder(Decoder):
 
     @property
     def constants(self) -> None:
-        """NumPy decodes them."""
+        """None, so that NumPy decodes spectrograms, and not compiled code."""
         return None
 
     def decode(

@@ -167,7 +167,8 @@ class LiveDecoder:
         return DryBlock(block.id, block.sequence, np.concatenate(pieces)[:, 0], concealed)
 
     def _lengths(self, block: DryPackets) -> list[int]:
-        """The samples of each packet, as it says. Raises RequestError malformed_block."""
+        """The number of samples in each packet, by its own header. Raises RequestError malformed_block if a packet is
+        damaged, or if their sum is not that of the block or too large."""
         try:
             lengths = [self._decoder.frames(packet) for packet in block.packets]
         except OpusError as exc:
@@ -182,7 +183,9 @@ class LiveDecoder:
         return lengths
 
     def _fill_in(self, lost: int, first: int, packet: bytes) -> list[FloatArray]:
-        """`lost` samples: the last of them by what `packet`, of `first` samples, says of the one before it."""
+        """Samples in place of `lost` ones before `packet`, which has `first` samples. It may hold a copy of the packet
+        before it (forward error correction), from which at most `first` of them are recovered. Earlier ones are
+        guessed."""
         recovered = min(lost, first)
         guessed = [self._decoder.conceal(lost - recovered)] if lost > recovered else []
         return [*guessed, self._decoder.recover(packet, recovered)] if recovered else guessed

@@ -34,9 +34,9 @@ MOST_BYTES = 512 * 1024
 
 
 class KeptEmitter(Message):
-    """An emitter: the message that adds it as it is now, the sample clock `since` which it is audible, or null, the
-    message that stops its clip, if one came, whether an `emitter_ended` is still to come, and the sequence of its
-    newest dry block, -1 before the first."""
+    """An emitter of a stream. `emitter` is the message that adds it as it is now. It is audible `since` this sample
+    clock; null means not yet. `stop` is the message that stops its clip, if one came. `ends` says whether an
+    `emitter_ended` is still to come. `newest_block` is the sequence of its newest dry block, -1 before the first."""
 
     emitter: AddEmitter
     since: Annotated[int, Field(ge=0)] | None

@@ -69,7 +69,7 @@ class AnySizeConvolver:
         self._shared_wanted[0] = filters
 
     def take_in(self, number: int, own: bool, shared: FloatArray, at_once: npt.NDArray[np.bool]) -> None:
-        """As of the compiled convolver."""
+        """As `CompiledConvolver.take_in` does."""
         for gain, gains in ((self._own_gain.get(number), np.float32(own)), (self._shared_gain[number], shared)):
             if gain is not None:
                 gain[1] = gains

@@ -25,8 +25,8 @@ _MOST = 2
 
 
 class MixerSet:
-    """The mixers of a renderer, by the number of channels of their responses, each of which is one of `hearings`.
-    `new_direct`, `new_convolver` and `new_bus` take that number and make the parts of a mixer."""
+    """The mixers of a renderer. There is at most one for each number of channels that responses may have, which are
+    `hearings`. `new_direct`, `new_convolver` and `new_bus` take such a number and make the parts of a mixer."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class MixerSet:
 
     @property
     def rests(self) -> bool:
-        """Whether nothing is pending: nothing to let go of until an emitter is removed or moves to another mixer."""
+        """Whether `let_go` has nothing to do until an emitter is removed or moves to another mixer."""
         return len(self._mixers) == 1 and not (self._leaving or self._ringing or self._hushed)
 
     def leave(self, mixer: Mixer, slot: int, *, has_played: bool) -> None:

@@ -9,9 +9,9 @@ and sums stay in registers.
 Eight complex numbers are one vector of sixteen lanes, the real parts in its first half and the imaginary parts in the
 second. A product then takes two steps: multiply by the real parts of one factor, repeated in both halves, and by its
 imaginary parts, crosswise and with opposed signs. Such a vector is one register with AVX-512 and two elsewhere, where
-registers are also fewer. There it is used only in loops that load more than they keep in registers, and the loop that
-keeps the most, a source's turn, works on one channel at a time with real and imaginary parts apart. Both ways round
-alike, to the last bit.
+registers are also fewer. There it is used only in loops that load more than they keep in registers. `add_turn`, which
+keeps the most, works there on one channel at a time, with real and imaginary parts in vectors of their own. The results
+are the same to the last bit.
 """
 
 import numpy as np
@@ -50,7 +50,8 @@ _SPECTRUM_AHEAD, _FILTER_AHEAD = 6 * LINE_BYTES, 16 * LINE_BYTES
 
 @compiled
 def mix_offset(channels, tile, channel, column) -> int:
-    """Index of the real parts of a tile in a mix; the imaginary parts follow."""
+    """The index in a mix of a tile (eight bins) of one channel and column: of its real parts, which the imaginary parts
+    follow."""
     return 16 * (COLUMNS * (channels * tile + channel) + column)
 
 
@@ -220,8 +221,8 @@ def _add_turn_of_channel(stage, channels, channel, members, newest, first, last)
 
 @compiled
 def _plus_product(total, total_i, ring, x, real, imaginary):
-    """Return the real and imaginary parts of a sum plus the product of a filter's values with eight bins at index
-    `x`."""
+    """Return the sums `total` and `total_i`, real and imaginary parts of eight bins, with a product added: the eight
+    bins at index `x` of a ring times a filter's values `real` and `imaginary`."""
     x_r, x_i = _load_narrow(ring, x), _load_narrow(ring, x + 8)
     total = multiply_subtract(x_i, imaginary, multiply_add(x_r, real, total))
     total_i = multiply_add(x_i, real, multiply_add(x_r, imaginary, total_i))

@@ -98,12 +98,12 @@ class ClipPlayer:
         self.reset()
 
     def stop(self, clock: int, fade: int) -> None:
-        """Fade out over `fade` samples from `clock` on: before `begin`, which tells the clock."""
+        """Fade out over `fade` samples from `clock` on. This takes effect when `begin` is called next."""
         self._stops_at, self.playback["fade_out"] = clock, fade
 
     def begin(self, clock: int) -> None:
-        """Say the clock of the next block's first sample. A clip that was to start earlier starts now, and one that was
-        to stop before it starts is over."""
+        """Set the clock of the next block's first sample. A clip that should have started earlier starts now. A clip
+        that should stop before it starts is over."""
         self.playback["starts_in"], self.playback["stops_in"] = max(0, self._starts_at - clock), NEVER
         stop_playback(self.playback, stops_in=self._stops_at - clock, fade=int(self.playback["fade_out"]))
 
@@ -156,7 +156,7 @@ class ClipPlayer:
 
 
 def _fade_out(since: npt.NDArray[np.int64], samples: int) -> FloatArray:
-    """Gains of samples `since` the beginning of a fade-out over so many samples."""
+    """The gains of a fade-out that lasts `samples`, at the sample numbers `since` its beginning."""
     phase = np.pi * np.minimum((since + 0.5) / samples, 1.0)
     return np.asarray(0.5 + 0.5 * np.cos(phase), np.float32)
 
@@ -198,7 +198,7 @@ class SharedSource:
         np.copyto(out, self._block)
 
     def skip(self, samples: int) -> None:
-        """Go on as if `samples` had been played, unless it plays already."""
+        """Go on as if `samples` had been played. After the first block, this changes nothing."""
         if self._clock < 0:
             self._source.skip(samples)
 
@@ -208,7 +208,8 @@ class SharedSource:
 
 
 class SourceTap:
-    """A `SharedSource` as one renderer plays it."""
+    """A `SharedSource` with the interface of a `Source`, for one renderer: it asks for the block that begins at the
+    clock of this renderer."""
 
     def __init__(self, shared: SharedSource, clock: Callable[[], int]) -> None:
         self._shared = shared
@@ -288,8 +289,8 @@ class LiveSource:
         self.queued += clean.size
 
     def lose(self, count: int) -> None:
-        """Let silence take the place of `count` samples that were lost, but no more than the lead: the queue fades out
-        before it, and what comes next fades in. What waits to play has nothing to conceal."""
+        """Queue silence in place of `count` lost samples, at most as many as the lead. The queue fades out before it,
+        and the next samples fade in. While nothing plays, the queue stays as it is."""
         if not self._is_playing:
             return
         # At least so many samples are in the queue of what plays.
@@ -301,7 +302,7 @@ class LiveSource:
 
     @property
     def target(self) -> int:
-        """How many samples wait before it begins, or begins again, to play."""
+        """The number of queued samples at which it begins, or begins again, to play."""
         return self._waits_for
 
     def process(self, out: FloatArray) -> None:

@@ -122,7 +122,8 @@ class _Books:
 
 @dataclass
 class _Hold:
-    """Who has no response yet of an emitter that is held: those who are waited for, and those who are not."""
+    """The listeners who have no response yet of an emitter that is held. It waits for those in `waiting`, and not for
+    those who are `late`."""
 
     waiting: set[Member]
     late: set[Member] = field(default_factory=set)

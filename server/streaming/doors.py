@@ -18,8 +18,8 @@ from server.scene.door import read_openness
 
 @dataclass(frozen=True)
 class DoorsMoved:
-    """What a session hears by with its doors in one state. The ways round edges are those of the state `before`, or
-    without it, as all else, of this one."""
+    """What a session computes sound with while its doors are in one state. With `before`, the ways round edges are
+    those of that earlier state, since finding them takes long; all else is of this one."""
 
     openness: Openness
     surroundings: MeshSurroundings
@@ -30,8 +30,8 @@ class DoorsMoved:
 
 @dataclass(frozen=True)
 class DoorRequest:
-    """A state of doors to prepare: with the ways of the state `before`, in a few milliseconds, or without it whole, in
-    tens of milliseconds or more."""
+    """A state of doors to prepare. With `before`, it keeps the ways round edges of that state, and takes a few
+    milliseconds. Without it, it finds them too, and takes tens of milliseconds or more."""
 
     moving: MeshWithDoors
     openness: Openness

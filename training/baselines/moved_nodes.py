@@ -9,8 +9,8 @@ from server.field.field import AcousticField
 
 
 def with_moved_nodes(field: AcousticField, rng: np.random.Generator) -> AcousticField:
-    """The field with its nodes elsewhere; both keep their responses in the same cache. A field that reuses no responses
-    is returned unchanged."""
+    """A copy of the field whose nodes are moved at random. Field and copy keep their responses in the same cache. A
+    field that reuses no responses is returned unchanged."""
     if not field.kind.reuses_responses:
         return field
     moved = copy.copy(field)

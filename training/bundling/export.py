@@ -251,7 +251,7 @@ def _accepting(reasons: Mapping[str, str]) -> tuple[AcceptedLaw, ...]:
 
 
 def _needed(accepting: tuple[AcceptedLaw, ...], health: Health) -> tuple[AcceptedLaw, ...]:
-    """Those of the accepted laws that are broken."""
+    """The accepted laws that the bundle does break."""
     broken = {finding.law.name for finding in health.accepted}
     return tuple(entry for entry in accepting if entry.law in broken)
 

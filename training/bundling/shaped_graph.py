@@ -107,7 +107,8 @@ class ShapedNearestGraph(nn.Module):
         return ((of_near(self._peaks)[:, None] * self._delay(shaped, later))[None],)
 
     def _expected(self, listener: Tensor, emitter: Tensor, yaw_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Lateness (channel,) and energy (channel, band, stretch)."""
+        """The expected lateness (channel,) in seconds, and the expected log energies (channel, band, stretch) without
+        spherical spreading, at one yaw."""
         covariance = self._covariance(listener, emitter)
         scalars = self._scalar_mean + (covariance[:-1, None] @ self._scalar_weights)[:, 0]
         shares = self._share_mean + covariance[-1] @ self._share_weights
@@ -144,7 +145,8 @@ class ShapedNearestGraph(nn.Module):
         return torch.cat([direct, torch.zeros(self._shape[-1] - 1, dtype=torch.float64)])
 
     def _stretches(self, arrival_s: Tensor) -> Tensor:
-        """(channel, stretch, sample)"""
+        """(channel, stretch, sample) weights of the stretches of time after the arrival, which add up to one and fade
+        into each other."""
         after_s = (torch.arange(self._bands.shape[-1]) / self._rate - arrival_s[:, None]).float()
         count = self._shape[-1]
         later = [_rise((after_s / edge - 1 + FADE) / (2 * FADE)) for edge in EDGES_S[: count - 1]]

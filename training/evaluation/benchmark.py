@@ -256,7 +256,8 @@ def _collected(
 
 
 def _summary(errors: npt.NDArray[np.float64], metric: Metric) -> Summary:
-    """Of all errors; those that could not be measured are counted, and are in the mean if the definition says so."""
+    """The summary of a metric's errors. Errors that could not be measured are counted, and are in the mean if the
+    definition of the metric says so."""
     missing = int(np.isnan(errors).sum())
     if metric.counted_as is None:
         return summarise(errors)

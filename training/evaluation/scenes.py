@@ -52,8 +52,8 @@ class Method:
 
 @dataclass(frozen=True)
 class SceneResult:
-    """The results of one scene. `methods` are by their names in the table; the default level is first, under its own
-    name."""
+    """The results of one scene. `methods` has them by the name of a method in the table; that of the default level is
+    `level`."""
 
     scene: str
     pairs: int
@@ -127,7 +127,7 @@ class SceneResult:
 
 
 def _network(column: str, method: str) -> str:
-    """The row of a column of the paper's network."""
+    """The name in the table of one of the paper's networks, from its column of an evaluation and its method."""
     return f"{method}{INTEGRATED}" if column.endswith(INTEGRATED) else method
 
 

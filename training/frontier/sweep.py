@@ -39,8 +39,9 @@ _STEPS = 60
 
 @dataclass(frozen=True)
 class Frontier:
-    """All measured points, the Pareto-optimal ones (quickest first), the default, and the floor. Points are chosen by
-    one half of the held-out pairs; all errors are of the other, of which `pairs` were measured."""
+    """All measured points, the Pareto-optimal ones (`best`, quickest first), the default, and the repeatability floor.
+    Points are chosen by one half of the held-out pairs. All errors are of the other half, of which `pairs` were
+    measured."""
 
     scene: str
     pairs: int
@@ -85,10 +86,15 @@ class Frontier:
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: held-out `pairs` at `yaws` orientations each, half of them to choose levels and half to
-    report errors, and a walk of `walk_s`, of which a level that computes every response anew uses `budget_s`. The
-    default level is the quickest that is about as accurate as the most accurate, among those whose response takes at
-    most `default_ms`; a level of directions if there is one."""
+    """How much is measured, and what the default level may cost.
+
+    Errors are of held-out `pairs` at `yaws` orientations each: one half chooses the levels, and the errors of the other
+    half are reported. Times are of a walk of `walk_s` seconds. A level that computes every response anew computes only
+    some of them, for about `budget_s`.
+
+    The default level is chosen among those whose response takes at most `default_ms`, and if there are levels of
+    directions, among these only. It is one of the quickest that are about as accurate as the most accurate.
+    """
 
     pairs: int = 80
     yaws: int = 3

@@ -104,7 +104,7 @@ def prepare(
 
 
 class _Preparation:
-    """One test on its way."""
+    """A test that is being made."""
 
     def __init__(self, held_out: HeldOut, bundles: Sequence[Bundle], options: Options, track: Track) -> None:
         self._held_out = held_out

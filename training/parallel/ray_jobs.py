@@ -77,7 +77,8 @@ def connected(address: str) -> Iterator["RayJobs"]:
 
 @dataclass
 class _Attempt(Generic[Argument]):
-    """One of the jobs. `tries` have failed; it is not begun again before `due_s` of the monotonic clock."""
+    """The next or present attempt at a job. `tries` attempts have failed before. It does not begin before `due_s` of
+    the monotonic clock."""
 
     job: Job[Argument]
     tries: int = 0
@@ -91,7 +92,7 @@ class RayJobs:
 
     @property
     def cores(self) -> int:
-        """Cores of the nodes that are there."""
+        """The number of cores of all nodes that are alive."""
         return _room(1)
 
     def __init__(self, *, tries: int = TRIES, backoff_s: float = BACKOFF_S, patience_s: float = PATIENCE_S) -> None:
@@ -147,7 +148,8 @@ class RayJobs:
                 ray.cancel(reference, force=True)
 
     def _put(self, shared: object, name: str) -> Any:
-        """The reference of an object in the store."""
+        """Put what all jobs share into Ray's object store, and return the reference to it. A failure is treated as
+        that of a job. `name` is the first job's, for the message. Raises ClusterError."""
         attempt = _Attempt(Job(f"what all jobs share, of which the first is {name}", None))
         while True:
             try:
@@ -175,7 +177,7 @@ class RayJobs:
 
 
 def _told(failure: BaseException) -> str:
-    """A line that says what happened."""
+    """One line about a failure: its type and the first line of its message."""
     lines = str(failure).strip().splitlines()
     return f"{type(failure).__name__}: {lines[0]}" if lines else type(failure).__name__
 
@@ -191,12 +193,13 @@ def _next_due(waiting: deque[_Attempt[Argument]]) -> _Attempt[Argument] | None:
 
 
 def _room(cores: int) -> int:
-    """How many jobs of so many cores the nodes that are there can run at once."""
+    """How many jobs of so many cores the nodes that are alive can run at once."""
     return sum(math.floor(node["Resources"].get("CPU", 0) / cores) for node in ray.nodes() if node["Alive"])
 
 
 def _run(packed: list[Any], code: str, argument: Any) -> Any:
-    """One job, in a worker process. `packed` holds a reference, so that Ray does not unpack what is shared for each."""
+    """Run one job in a worker process. `packed` is a list with the reference to what all jobs share: Ray would unpack a
+    bare reference anew for each job. Raises ClusterError if the code of this process has another digest than `code`."""
     if code_digest() != code:
         raise ClusterError(f"node {ray.util.get_node_ip_address()} runs another version of Nafir: install the same")
     work, shared = _unpacked(packed[0])

@@ -40,7 +40,7 @@ class Hits(NamedTuple):
 
 
 def cast(surfaces: Surfaces, origins: _Floats, directions: _Floats) -> Hits:
-    """What rays meet first. `origins` and `directions` are (ray, 3), of length one."""
+    """Find the rectangle that each ray meets first. `origins` are (ray, 3), `directions` (ray, 3) of length one."""
     depth_m, number, place = np.empty(len(origins)), np.empty(len(origins), np.int64), np.empty((len(origins), 2))
     ahead = np.einsum("sk,sk->s", surfaces.normal, surfaces.origin)
     edges = [edge / np.sum(edge**2, axis=-1, keepdims=True) for edge in (surfaces.along, surfaces.up)]
@@ -235,12 +235,13 @@ _SPHERE = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1], [0
 
 
 def _above(points: _Floats) -> _Floats:
-    """Points with a height that is within every room."""
+    """The points (point, 3) moved to a height that lies within every room, so that `Flat.room_of` finds the rooms of
+    floors, too."""
     return np.concatenate([points[:, :2], np.full((len(points), 1), 0.1)], axis=1)
 
 
 def _noise(number: npt.NDArray[np.generic], salt: int) -> _Floats:
-    """Values from 0 to 1 that look random, the same for the same number."""
+    """Values from 0 to 1 that look random. They are the same for the same number and `salt`."""
     mixed = np.sin(np.asarray(number, float) * 12.9898 + salt * 78.233) * 43758.5453
     return np.asarray(mixed - np.floor(mixed))
 

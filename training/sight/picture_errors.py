@@ -11,7 +11,7 @@ _SMALL_MEAN, _SMALL_VARIANCE = 0.01**2, 0.03**2
 
 
 def mean_squared_error(picture: _Pixels, truth: _Pixels) -> float:
-    """Of values from 0 to 1."""
+    """The mean squared error of two pictures whose values are scaled to the range from 0 to 1."""
     return float(np.mean(((picture.astype(np.float64) - truth) / 255) ** 2))
 
 

@@ -42,7 +42,7 @@ class GeometricSound:
 
     @cached_property
     def _direct_paths(self) -> dict[int, DirectPaths]:
-        """By emitter."""
+        """The direct paths from each emitter, by its probe."""
         dataset = self.dataset
         found: dict[int, DirectPaths] = {}
         for one, emitters in dataset.scenes.groups(np.arange(len(dataset.probes))).items():

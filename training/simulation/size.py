@@ -50,7 +50,7 @@ class SimulationSize:
 
     @property
     def memory_gb(self) -> float:
-        """Memory for one emitter."""
+        """The memory that a worker needs to simulate one emitter."""
         return _memory_gb(self.scene.simulation, self.probes)
 
     def sequences_of(self, order: int) -> float:
@@ -159,7 +159,8 @@ def _dataset_gb(simulation: Simulation, probes: int) -> float:
 
 
 def _memory_gb(simulation: Simulation, probes: int) -> float:
-    """Memory for one emitter: energies three times in single precision and once in half precision."""
+    """The memory that a worker needs to simulate one emitter: the energies of its pairs, three times in single
+    precision and once in half precision, and 24 bytes for each ray."""
     return (14 * probes * _pair_energies(simulation) + 24 * simulation.rays) / 1e9
 
 

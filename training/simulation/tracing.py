@@ -62,7 +62,8 @@ class _PlanImages:
         self._specular_amplitudes = np.sqrt(np.prod([reflected, 1 - scattered], axis=0))
 
     def find(self, emitter: _Floats) -> tuple[npt.NDArray[np.int64], _Floats, _Floats]:
-        """(image,) receivers, (image, xyz) positions, and (image, band) what surfaces leave of amplitudes."""
+        """The receiver of each image (image,), its position (image, xyz), and the factor (image, band) that reflections
+        leave of its amplitude."""
         order = self._order
         heights, level = images_in_height(float(emitter[2]), self._plan.height_m, order)
         receiver, plan, walls = images_in_plan(self._plan, emitter[:2], self._receivers[:, :2], order)
@@ -84,7 +85,7 @@ class _MeshImages:
         self._finder = surroundings.first_reflections(gains_db) if least_order <= 1 else None
 
     def find(self, emitter: _Floats) -> tuple[npt.NDArray[np.int64], _Floats, _Floats]:
-        """As of `_PlanImages`."""
+        """As `_PlanImages.find` does, for images by one surface."""
         if self._finder is None:
             return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, len(OCTAVE_BANDS_HZ)))
         found = self._finder.find(emitter, self._receivers)  # a path is the same in both directions
