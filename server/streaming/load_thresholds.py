@@ -20,7 +20,7 @@ class Thresholds:
     """Responses per second and emitter on the steps below the top: reverberation that follows a walk 12 times a second
     is hardly distinguishable from one that follows every pose; at 5 times a lag is audible."""
     least_ir_rate_hz: float = 2.0
-    """Responses per second and emitter on the lowest step: a walk is still followed."""
+    """The fewest responses per second and emitter on any step: a walk is still followed."""
 
     late_reach_m: float = 0.5
     """Metres that listener and emitter may move, together, before the later part of a response is computed anew, on the
