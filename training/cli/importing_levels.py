@@ -3,45 +3,82 @@ scene bundle of it."""
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from server.core.command_line import writable_folder
 from server.core.files import require_matplotlib
+from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from training.cli.options import Json, Seed
-from training.data.levels.axis_options import Handedness, Units, Up
+from training.data.levels.import_options import MERGE_WITHIN_M, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
+from training.data.limits import FEWEST_RAYS, MOST_RAYS
+
+if TYPE_CHECKING:
+    from training.data.levels.level_import import Choices
 
 MOST_MERGED_M = 0.1
 
+LevelPath = Annotated[Path, typer.Argument(help="Level to read: .glb, .gltf or .obj.")]
+UnitsOption = Annotated[
+    Units | None, typer.Option("--units", help="Unit of coordinates; OBJ does not say it, glTF has metres.")
+]
+UpOption = Annotated[Up | None, typer.Option("--up", help="Axis that points up; OBJ does not say it, in glTF it is y.")]
+HandednessOption = Annotated[Handedness | None, typer.Option("--handedness", help="Of the axes; right if not given.")]
+SceneName = Annotated[
+    str | None, typer.Option("--scene", help="Which scene, by name or number, where a file has several.")
+]
+MaterialsFile = Annotated[
+    Path | None, typer.Option("--materials", help="TOML file that says what the level's materials are.")
+]
+DefaultMaterial = Annotated[
+    str | None, typer.Option("--default-material", help="Row of the table for materials that are in neither.")
+]
+OpenSky = Annotated[bool, typer.Option("--open", help="The level has open sky: sound may leave it.")]
+MergeWithin = Annotated[
+    float,
+    typer.Option(
+        "--merge-within-m",
+        min=0.0,
+        max=MOST_MERGED_M,
+        help="Merge flat triangles; no surface moves farther. 0 merges none.",
+    ),
+]
+SampleRate = Annotated[
+    int,
+    typer.Option(
+        "--sample-rate",
+        min=LOWEST_RATE_HZ,
+        max=HIGHEST_RATE_HZ,
+        help="Of simulated responses, in Hz. They hold sound up to half of it.",
+    ),
+]
+Rays = Annotated[
+    int,
+    typer.Option("--rays", min=FEWEST_RAYS, max=MOST_RAYS, help="Of each emitter in the simulation."),
+]
+
 
 def import_level(
-    level: Annotated[Path, typer.Argument(help="Level to read: .glb, .gltf or .obj.")],
+    level: LevelPath,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.", callback=writable_folder)],
-    units: Annotated[
-        Units | None, typer.Option(help="Unit of coordinates; OBJ does not say it, glTF has metres.")
-    ] = None,
-    up: Annotated[Up | None, typer.Option(help="Axis that points up; OBJ does not say it, in glTF it is y.")] = None,
-    handedness: Annotated[Handedness | None, typer.Option(help="Of the axes; right if not given.")] = None,
-    scene: Annotated[str | None, typer.Option(help="Which scene, by name or number, where a file has several.")] = None,
-    materials: Annotated[Path | None, typer.Option(help="TOML file that says what the level's materials are.")] = None,
-    default_material: Annotated[
-        str | None, typer.Option(help="Row of the table for materials that are in neither.")
-    ] = None,
-    is_open: Annotated[bool, typer.Option("--open", help="The level has open sky: sound may leave it.")] = False,
-    merge_within_m: Annotated[
-        float,
-        typer.Option(min=0.0, max=MOST_MERGED_M, help="Merge flat triangles; no surface moves farther. 0 merges none."),
-    ] = 0.005,
+    units: UnitsOption = None,
+    up: UpOption = None,
+    handedness: HandednessOption = None,
+    scene: SceneName = None,
+    materials: MaterialsFile = None,
+    default_material: DefaultMaterial = None,
+    is_open: OpenSky = False,
+    merge_within_m: MergeWithin = MERGE_WITHIN_M,
+    sample_rate: SampleRate = SAMPLE_RATE_HZ,
+    rays: Rays = RAYS,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """Read a level (glTF or OBJ), examine and mend its mesh, and write scene.toml, geometry.npz and a report."""
     require_matplotlib("import-level")
-    from training.data.levels.level_import import PICTURE_FILE, Choices, write_level
-    from training.data.levels.level_import import import_level as read_level
-    from training.data.levels.level_source import LevelError
+    from training.data.levels.level_import import Choices
 
     choices = Choices(
         units,
@@ -52,8 +89,19 @@ def import_level(
         default_material,
         is_open,
         merge_within_m,
+        sample_rate,
+        rays,
         seed,
     )
+    write_scene(level, choices, output, as_json=as_json)
+
+
+def write_scene(level: Path, choices: "Choices", output: Path, *, as_json: bool = False) -> None:
+    """Imports a level and prints its report. Raises LevelError for one that is refused, whose report is written."""
+    from training.data.levels.level_import import PICTURE_FILE, write_level
+    from training.data.levels.level_import import import_level as read_level
+    from training.data.levels.level_source import LevelError
+
     with Console(stderr=True).status(f"examining {level.name}"):
         imported = read_level(level, choices)
         write_level(imported, output)

@@ -13,8 +13,9 @@ from server.acoustics.geometry import Points
 from server.core.errors import NafirError
 from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
-from server.scene.limits import MOST_SAMPLES
+from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from server.scene.manifest import Air, Start
+from training.data.limits import FEWEST_RAYS, MOST_RAYS
 from training.data.scene_openings import faults_of
 from training.data.simulation_plan import SimulatedEffect
 
@@ -61,10 +62,10 @@ class Simulation(Strict):
     nothing. The random error of `rays` falls with the square root of their number: a hundred times the usual number has
     a tenth of an error that is inaudible already."""
 
-    sample_rate: Annotated[int, Field(ge=8000, le=96000)]
+    sample_rate: Annotated[int, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
     duration_s: Annotated[float, Field(ge=0.25, allow_inf_nan=False)]
     yaws: Annotated[int, Field(ge=1, le=360)]
-    rays: Annotated[int, Field(ge=100, le=2_000_000)]
+    rays: Annotated[int, Field(ge=FEWEST_RAYS, le=MOST_RAYS)]
     image_order: Annotated[int, Field(ge=1, le=6)]
     arrival_directions: Annotated[int, Field(ge=6, le=1_000)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
@@ -72,7 +73,7 @@ class Simulation(Strict):
     @field_validator("duration_s")
     @classmethod
     def _is_in_seconds(cls, duration_s: float) -> float:
-        longest_s = MOST_SAMPLES / 8000
+        longest_s = MOST_SAMPLES / LOWEST_RATE_HZ
         if duration_s > longest_s:
             raise ValueError(f"at most {longest_s:g} s, and less at higher sample rates; is {duration_s:g} in ms?")
         return duration_s

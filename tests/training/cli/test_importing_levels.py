@@ -5,6 +5,7 @@ import pytest
 from tests.training.data.levels.conftest import room
 from training.cli.main import main
 from training.data.levels.gltf_writer import write_glb
+from training.data.levels.level_scene import LevelScene
 
 
 @pytest.fixture
@@ -34,6 +35,15 @@ def test_a_level_is_imported_reported_and_drawn(nafir_train, tmp_path):
     assert names == ["geometry.npz", "report.json", "report.png", "scene.toml"]
 
 
+@pytest.mark.parametrize("rate", [24_000, 44_100, 48_000])
+def test_the_scene_is_simulated_at_the_rate_and_with_the_rays_that_are_asked_for(nafir_train, tmp_path, rate):
+    write_glb(tmp_path / "level.glb", [room()])
+    code, _, _ = nafir_train(tmp_path / "level.glb", "-o", tmp_path, "--sample-rate", rate, "--rays", "5000")
+    assert code == 0
+    simulation = LevelScene.read(tmp_path).simulation
+    assert (simulation.sample_rate, simulation.rays) == (rate, 5000)
+
+
 def test_a_refused_level_is_one_line_and_the_json_says_why(nafir_train, tmp_path):
     write_glb(tmp_path / "level.glb", [room("M_042", without=(4, 10))])
     code, out, err = nafir_train(tmp_path / "level.glb", "-o", tmp_path / "scene", "--json")
@@ -50,6 +60,8 @@ def test_a_refused_level_is_one_line_and_the_json_says_why(nafir_train, tmp_path
         (["missing.glb"], "there is no such file"),
         (["level.fbx"], "levels are read from .glb, .gltf, .obj"),
         (["level.glb", "--merge-within-m", "1"], "--merge-within-m"),
+        (["level.glb", "--sample-rate", "4000"], "--sample-rate"),
+        (["level.glb", "--rays", "10"], "--rays"),
         (["level.glb", "--default-material", "brik"], "near: brick"),
         (["level.glb", "--materials", "missing.toml"], "cannot be read"),
         (["level.glb", "--scene", "9"], "--scene: '9' is no scene"),

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from server.acoustics.mesh import MeshError, TriangleMesh
 from training.data.levels.contacts import Cells, cells_of, find_contacts, lies_on_others
 from training.data.levels.decimation import merge_flat
+from training.data.levels.import_options import MERGE_WITHIN_M
 from training.data.levels.leaks import Escape, escaping
 from training.data.levels.level import Level, LevelDoor, Surfaces
 from training.data.levels.space import OUTSIDE, Space, sample_space
@@ -26,8 +27,6 @@ SMALLEST_ROOM_M3 = 1.0
 """Air in less than this is no room: the inside of a cupboard, or a gap between walls."""
 MOST_ESCAPING = 0.1
 """The share of rays that may leave a level that is not said to be open to the sky."""
-MERGE_WITHIN_M = 0.005
-"""How far merging may move a surface: an eighth of the wavelength at 8 kHz."""
 _EXAMPLES = 3
 _ORIGINS = 60
 _MOST_HOLES = 1_000

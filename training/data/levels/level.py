@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError
 from server.acoustics.mesh import LONGEST_NAME
 from server.scene.door import DOOR_NAME
 from server.scene.geometry import Finite, Strict
-from training.data.levels.axis_options import Handedness, Units, Up
+from training.data.levels.import_options import Handedness, Units, Up
 from training.data.levels.level_source import LevelError, LevelSource, Node, Part
 
 _Floats = npt.NDArray[np.float64]

@@ -14,9 +14,9 @@ from scipy.ndimage import distance_transform_edt
 from server.acoustics.mesh import MeshError, TriangleMesh
 from server.scene.geometry import Material
 from server.scene.manifest import Start
-from training.data.levels.axis_options import Handedness, Units, Up
-from training.data.levels.examination import MERGE_WITHIN_M, Examination, examine
+from training.data.levels.examination import Examination, examine
 from training.data.levels.gltf_file import read_gltf
+from training.data.levels.import_options import MERGE_WITHIN_M, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
 from training.data.levels.level import GLTF_AXES, Axes, Level, level_of
 from training.data.levels.level_scene import (
     MESH_FILE,
@@ -58,6 +58,8 @@ class Choices:
     default_material: str | None = None
     is_open: bool = False
     merge_within_m: float = MERGE_WITHIN_M
+    sample_rate: int = SAMPLE_RATE_HZ
+    rays: int = RAYS
     seed: int = 0
 
 
@@ -71,8 +73,9 @@ class ImportedLevel:
     places: Sequence[tuple[str, _Point]]
 
 
-def import_level(path: Path, choices: Choices) -> ImportedLevel:
-    """Read and examine a level. Raises LevelError where nothing can be examined."""
+def read_level(path: Path, choices: Choices) -> tuple[LevelSource, Axes, list[str]]:
+    """What a level's file holds, the axes in which it is read, and what was decided against its format. Raises
+    LevelError for a file that is no level."""
     if path.suffix.lower() not in _FORMATS:
         raise LevelError(path, "format", f"{path.suffix or 'none'}, and levels are read from {', '.join(_FORMATS)}")
     if not path.is_file():
@@ -81,7 +84,12 @@ def import_level(path: Path, choices: Choices) -> ImportedLevel:
     axes, notes = _axes(path, choices, is_obj=is_obj)
     if is_obj and choices.scene is not None:
         raise LevelError(path, "--scene", "an OBJ file has one scene: leave it out")
-    source: LevelSource = read_obj(path) if is_obj else read_gltf(path, choices.scene)
+    return read_obj(path) if is_obj else read_gltf(path, choices.scene), axes, notes
+
+
+def import_level(path: Path, choices: Choices) -> ImportedLevel:
+    """Read and examine a level. Raises LevelError where nothing can be examined."""
+    source, axes, notes = read_level(path, choices)
     level = level_of(path, source, axes)
     if not len(level.surfaces.triangles):
         raise LevelError(path, "triangles", "there are none that stand still: is the level on a hidden layer?")
@@ -119,7 +127,7 @@ def import_level(path: Path, choices: Choices) -> ImportedLevel:
     if problems:
         return ImportedLevel(report, None, {}, places)
     materials = {each.name: each.material for each in assignments if each.material is not None and each.name in used}
-    file = _file(path, level, seen, materials, start, is_open=choices.is_open)
+    file = _file(path, level, seen, materials, start, choices)
     return ImportedLevel(report, LevelScene(file, seen.mesh, seen.doors), _comments(report.assignments), places)
 
 
@@ -234,8 +242,7 @@ def _file(
     seen: Examination,
     materials: Mapping[str, Material],
     start: Start,
-    *,
-    is_open: bool,
+    choices: Choices,
 ) -> LevelFile:
     doors = tuple(
         SceneDoor(
@@ -259,7 +266,7 @@ def _file(
         geometry=LevelGeometry(
             mesh=MESH_FILE,
             materials=dict(materials),
-            open_sky=is_open,
+            open_sky=choices.is_open,
             doors=doors,
             emitters=tuple(EmitterPlace(name=name, position=_round(at)) for name, at in level.emitters),
             spawns=tuple(
@@ -269,10 +276,10 @@ def _file(
         start=start,
         probes=Probes(spacing_m=1.0, jitter_m=0.2, wall_clearance_m=0.4, heights_m=(1.2, 1.9)),
         simulation=Simulation(
-            sample_rate=24_000,
+            sample_rate=choices.sample_rate,
             duration_s=_duration_s(seen, materials),
             yaws=12,
-            rays=20_000,
+            rays=choices.rays,
             image_order=3,
             arrival_directions=24,
             held_out_share=0.1,

@@ -1,5 +1,7 @@
 """What a level's file holds, before anything is made of it: triangles by node and material, in the file's own axes."""
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -55,6 +57,19 @@ class LevelSource:
     nodes: tuple[Node, ...]
     parts: tuple[Part, ...]
     notes: tuple[str, ...] = ()
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its nodes and triangles. Textures and whatever else of the file is left out do not change it."""
+        digest = hashlib.sha256()
+        for node in self.nodes:
+            digest.update(json.dumps([node.name, node.parent, dict(node.extras)], sort_keys=True).encode())
+            digest.update(node.to_file.tobytes())
+        for part in self.parts:
+            digest.update(json.dumps([part.node, part.material, len(part.vertices), len(part.triangles)]).encode())
+            digest.update(part.vertices.tobytes())
+            digest.update(part.triangles.tobytes())
+        return digest.hexdigest()
 
 
 def require_few(path: object, triangles: int) -> None:

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from tests.training.data.levels.conftest import box, empty, room
-from training.data.levels.axis_options import Units, Up
 from training.data.levels.gltf_writer import Piece, WrittenNode, glb_bytes, gltf_of, write_glb
+from training.data.levels.import_options import Units, Up
 from training.data.levels.level_import import Choices, import_level, write_level
 from training.data.levels.level_scene import LevelScene
 from training.data.levels.level_source import LevelError

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.training.data.levels.conftest import box, empty, room
-from training.data.levels.axis_options import Handedness, Units, Up
 from training.data.levels.gltf_file import read_gltf
 from training.data.levels.gltf_writer import Piece, WrittenNode
+from training.data.levels.import_options import Handedness, Units, Up
 from training.data.levels.level import GLTF_AXES, Axes, level_of
 from training.data.levels.level_source import LevelError, LevelSource, Node, Part
 

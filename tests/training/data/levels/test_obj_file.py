@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from tests.training.data.levels.conftest import box
-from training.data.levels.axis_options import Handedness, Units, Up
+from training.data.levels.import_options import Handedness, Units, Up
 from training.data.levels.level import Axes, level_of
 from training.data.levels.level_source import LevelError
 from training.data.levels.obj_file import read_obj

@@ -1,6 +1,12 @@
-"""Units and axes of a level's file. This module imports nothing heavy, for the command line."""
+"""Options of an import: units and axes of a level's file, and what is taken where nothing is asked for. This module
+imports nothing heavy, for the command line."""
 
 from enum import StrEnum
+
+MERGE_WITHIN_M = 0.005
+"""How far merging may move a surface: an eighth of the wavelength at 8 kHz."""
+SAMPLE_RATE_HZ, RAYS = 24_000, 20_000
+"""Of the simulation."""
 
 
 class Units(StrEnum):
