@@ -25,13 +25,13 @@ _SHORTEST_S, _AFTER_S = 0.25, 0.05
 """A response lasts at least so long, and so much longer than a reflection across the whole place."""
 
 
-def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
-    """Write the bundle, whose doors move, and load it back. Raises SceneFileError for more triangles or doors than a
-    bundle may have, and for a start that is not in the air."""
-    place = scene.place
-    if len(place.mesh.triangles) > MOST_TRIANGLES:
+def require_bundled(scene: LevelScene) -> None:
+    """Raises SceneFileError for more triangles or doors than a bundle may have, and for a start that is not in the
+    air."""
+    triangles = len(scene.place.mesh.triangles)
+    if triangles > MOST_TRIANGLES:
         raise SceneFileError(
-            f"{scene.id}: geometry.mesh: {len(place.mesh.triangles):,} triangles with its doors, and a bundle has at "
+            f"{scene.id}: geometry.mesh: {triangles:,} triangles with its doors, and a bundle has at "
             f"most {MOST_TRIANGLES:,}: import the level with a larger --merge-within-m, or with less detail"
         )
     if len(scene.doors) > MOST_DOORS:
@@ -43,6 +43,12 @@ def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
         if not scene.surroundings.holds(position):
             problem = "is not in the air: it is inside something, or outside"
             raise SceneFileError(f"{scene.id}: start.{name}: {position} {problem}")
+
+
+def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
+    """Write the bundle, whose doors move, and load it back. Raises SceneFileError for what a bundle cannot hold."""
+    require_bundled(scene)
+    place = scene.place
     (west, south, low), (east, north, high) = place.mesh.bounds_m.tolist()
     longest_s = 2 * math.dist((west, south, low), (east, north, high)) / SPEED_OF_SOUND + _AFTER_S
     samples = _HOP * math.ceil(max(_SHORTEST_S, longest_s) * _SAMPLE_RATE / _HOP)

@@ -10,8 +10,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from server.core.command_line import require_at_most_one
 from server.core.errors import NafirError
-from training.cli.options import Seed
+from training.cli.learning import print_findings
+from training.cli.options import Cluster, Folder, Seed, progress_bar
 
 if TYPE_CHECKING:
     from training.data.levels.level_scene import LevelScene
@@ -33,6 +35,8 @@ Effects = Annotated[
         "[effects].",
     ),
 ]
+
+Workers = Annotated[int, typer.Option(min=0, help="Threads; 0 for one per core.")]
 
 
 def wide_console(*, stderr: bool = False) -> Console:
@@ -200,3 +204,40 @@ def _caption(plan: "SimulationPlan") -> str:
     measured = any(each.cost_s is not None for each in plan.decisions)
     how = "by short runs of its parts here" if measured else "at most, by its numbers alone"
     return f"about {plan.cost_s:,.0f} s of one core, {how}"
+
+
+def simulate(
+    scene: Scene,
+    output: Folder,
+    effects: Effects = "plan",
+    seed: Seed = 0,
+    workers: Workers = 0,
+    cluster: Cluster = None,
+) -> None:
+    """Simulate what a scene calls for, between all pairs of probes. Run again after an interruption to go on."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    require_at_most_one({"--workers": workers > 0, "--cluster": cluster is not None})
+    simulate_into(output, scene, effects=effects, seed=seed, workers=workers, cluster=cluster)
+
+
+def simulate_into(
+    output: Path, scene: Path, *, effects: str, seed: int, workers: int, cluster: str | None = None
+) -> None:
+    """Fills a dataset folder, or goes on where it stopped, and prints the plan and what the dataset holds."""
+    from training.data.levels.level_scene import read_scene
+    from training.data.scene_file import SceneFile
+    from training.parallel.jobs import open_jobs
+    from training.simulation.responses import SimulatedResponses
+    from training.simulation.run import simulate as simulate_scene
+
+    console = wide_console(stderr=True)
+    with console.status("planning, and tracing the late sound that pairs may share"):
+        ready = simulation_of(scene, seed, effects)
+        read = read_scene(scene)
+    print_plan(console, read, ready.plan, seed)
+    with open_jobs(cluster, threads=workers or os.cpu_count() or 1) as jobs, progress_bar() as progress:
+        dataset = simulate_scene(scene, output, seed=seed, jobs=jobs, progress=progress, simulation=ready)
+    if isinstance(read, SceneFile):
+        print_findings(SimulatedResponses(dataset))
+    trained, held_out = (len(dataset.pairs(held_out=held_out)) for held_out in (False, True))
+    typer.echo(f"{output}: {trained} pairs to train on and {held_out} held out, {len(dataset.yaws)} orientations each")

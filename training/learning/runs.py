@@ -273,6 +273,11 @@ def load_checkpoint(run: Path, device: torch.device) -> dict[str, Any]:
         raise RunError(f"{run}: holds no checkpoint: {exc.strerror}") from exc
 
 
+def is_finished(run: Path) -> bool:
+    """Whether a run is trained to its end. Raises RunError if there is no checkpoint."""
+    return bool(load_checkpoint(run, torch.device("cpu"))["finished"])
+
+
 def restore(field: torch.nn.Module, run: Path, configuration: Configuration) -> None:
     """Load the parameters of a finished run into the field. Raises RunError if the run is unfinished, or of another
     network."""
