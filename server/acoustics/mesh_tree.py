@@ -128,7 +128,8 @@ class MeshTree:
     def contains(self, points: Points, *, is_open: bool = False) -> _Flags:
         """(...,) whether each point is in the air that the mesh encloses, or on its surfaces: whether in most
         directions the first triangle shows its face. A few holes or flipped triangles do not change that. Under the
-        open sky, with `is_open`, a point is in the air unless triangles show it more backs than faces."""
+        open sky, with `is_open`, a point is in the air if triangles show it more faces than backs. If they show as many
+        of both, or if there are none, it is in the air unless what is straight below shows its back."""
         places = np.asarray(points, dtype=np.float64)
         flat = np.ascontiguousarray(places.reshape(-1, 3))
         inside = np.empty(len(flat), np.bool_)

@@ -504,7 +504,11 @@ def find_inside(
                     faces += 1
                 else:
                     backs += 1
-        inside[row] = touches or (faces >= backs if is_open else 2 * faces > len(looks))
+        if is_open and faces == backs:
+            _, hit, is_facing = closest_hit(tree, stack, x, y, z, 0.0, 0.0, -1.0, OVERLAP_M, math.inf, -1)
+            inside[row] = touches or hit < 0 or is_facing
+        else:
+            inside[row] = touches or (faces > backs if is_open else 2 * faces > len(looks))
 
 
 @compiled

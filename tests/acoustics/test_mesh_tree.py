@@ -281,3 +281,22 @@ def test_distance_is_that_of_the_nearest_point_of_any_triangle():
     assert np.all(found <= nearest + 1e-12)
     assert np.all(nearest - found < 0.06)
     assert MeshTree(mesh).distance_m(mesh.corners_m).max() < 1e-12
+
+
+def test_nothing_above_a_ceiling_is_in_the_air_under_an_open_sky():
+    """In the corner above a room, no direction but straight down meets anything."""
+    tree = MeshTree(mesh_of(room((0, 0, 0), (10, 8, 2.6))))
+    rng = np.random.default_rng(4)
+    above = rng.uniform((0.01, 0.01, 2.7), (9.99, 7.99, 8.0), (2_000, 3))
+    assert not tree.contains(above, is_open=True).any()
+    assert tree.contains(rng.uniform((0.1, 0.1, 0.1), (9.9, 7.9, 2.5), (200, 3)), is_open=True).all()
+
+
+def test_what_is_above_the_ground_or_beside_it_is_in_the_air_under_an_open_sky():
+    ground = mesh_of(([(0, 0, 0), (10, 0, 0), (10, 8, 0), (0, 8, 0)], [(0, 1, 2), (0, 2, 3)]))
+    rng = np.random.default_rng(5)
+    low, high = (0.01, 0.01), (9.99, 7.99)
+    above = rng.uniform((*low, 0.01), (*high, 60.0), (2_000, 3))
+    tree = MeshTree(ground)
+    assert tree.contains(above, is_open=True).all()
+    assert tree.contains((30.0, 4.0, 1.0), is_open=True)

@@ -1,9 +1,11 @@
 import importlib.util
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
+from server.acoustics.mesh_tree import MeshTree
 from training.data.levels.gltf_writer import write_glb
 from training.data.levels.level_import import Choices, import_level
 
@@ -55,6 +57,18 @@ def test_its_rooms_are_parted_by_its_doors_and_hold_their_air(make, imported):
     assert 0.93 * air_m3("living") < living.volume_m3 < 1.01 * air_m3("living")
     total = sum(room.volume_m3 for room in rooms)
     assert total == pytest.approx(imported.scene.mesh.volume_m3, rel=0.015)
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_nothing_but_its_rooms_is_air(make, imported, is_open):
+    """Not above the roof of its ground floor either, under the open sky or not."""
+    points = np.random.default_rng(2).uniform((0, 0, 0), (10, 8, 5.4), (20_000, 3))
+    air = np.zeros(len(points), np.bool_)
+    for filled in (*make.ROOMS, *(door.doorway for door in make.DOORS), *make.FURNITURE, *make.HOLLOWS):
+        low, high = np.array(filled.ends).T
+        air[((points > low) & (points < high)).all(axis=1)] = isinstance(filled, make.Room)
+    found = MeshTree(imported.scene.mesh).contains(points, is_open=is_open)
+    np.testing.assert_array_equal(found, air)
 
 
 def test_trimesh_finds_it_watertight_too():
