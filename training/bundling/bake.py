@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -73,7 +74,9 @@ class Bake:
         return self.folder / stage.value
 
     def claim(self) -> None:
-        """Makes the folder, or goes on with it. Raises BakeError for a folder that holds something else."""
+        """Makes the folder, or goes on with it. Raises LevelError for a file that is no level, and BakeError for a
+        folder that holds something else."""
+        _ = self._sources
         if (self.folder / RECORD_FILE).exists():
             return
         if self.folder.exists() and any(self.folder.iterdir()):
@@ -135,7 +138,7 @@ class Bake:
             if self.path(later).exists():
                 shutil.rmtree(self.path(later))
 
-    @property
+    @cached_property
     def _sources(self) -> dict[str, str]:
         """All that decides what a scene is, by the name by which it is told."""
         source, _, _ = read_level(self.level, self.choices)

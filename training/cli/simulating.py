@@ -44,15 +44,19 @@ def wide_console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, width=None if Console(stderr=stderr).is_terminal else 150)
 
 
-def simulation_of(scene: Path, seed: int, effects: str) -> "PairSimulation":
-    """A prepared simulation, with a plan that predicts its cost on this host."""
-    from training.data.levels.level_scene import LevelScene
+def simulation_of(scene: Path, seed: int, effects: str, folder: Path) -> "PairSimulation":
+    """A prepared simulation, new or as it was begun in `folder`, with a plan that predicts its cost on this host."""
+    from training.data.dataset import Dataset
+    from training.data.levels.level_scene import LevelScene, is_same_scene
     from training.simulation.cost import is_brief, predicted_s, with_costs
     from training.simulation.run import prepared
     from training.simulation.size import level_extent
 
     read, decided = _plan_by_size(scene, seed, effects)
-    simulation = prepared(read, seed=seed, plan=decided)
+    begun = Dataset.open(folder, finished=False) if (folder / "pairs.h5").exists() else None
+    if begun is not None and (begun.seed != seed or not is_same_scene(begun.place, read)):
+        begun = None  # `simulate` refuses the folder
+    simulation = prepared(read, seed=seed, plan=decided, begun=begun)
     if isinstance(read, LevelScene):
         level_extent(read, len(simulation.probes))  # before anything is traced
         return replace(simulation, plan=replace(decided, cost_s=predicted_s(simulation)))
@@ -232,7 +236,7 @@ def simulate_into(
 
     console = wide_console(stderr=True)
     with console.status("planning, and tracing the late sound that pairs may share"):
-        ready = simulation_of(scene, seed, effects)
+        ready = simulation_of(scene, seed, effects, output)
         read = read_scene(scene)
     print_plan(console, read, ready.plan, seed)
     with open_jobs(cluster, threads=workers or os.cpu_count() or 1) as jobs, progress_bar() as progress:

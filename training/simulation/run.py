@@ -15,6 +15,7 @@ import numpy.typing as npt
 from rich.progress import Progress
 
 from training.data.dataset import Dataset
+from training.data.dataset_check import DatasetError
 from training.data.door_states import DoorStates
 from training.data.levels.level_scene import LevelScene, read_scene
 from training.data.simulated_scene import SimulatedScene
@@ -28,13 +29,18 @@ _Takes = list[dict[int, npt.NDArray[np.float16]]]
 
 
 def prepared(
-    scene: SimulatedScene, *, seed: int, plan: SimulationPlan, most_tail_rays: int | None = None
+    scene: SimulatedScene,
+    *,
+    seed: int,
+    plan: SimulationPlan,
+    most_tail_rays: int | None = None,
+    begun: Dataset | None = None,
 ) -> PairSimulation:
     """Prepare the simulation of all pairs of probes in a dataset of this seed; `most_tail_rays` as in
-    `PairSimulation.prepare`."""
+    `PairSimulation.prepare`. One that is `begun` keeps its probes, which another version may have placed elsewhere."""
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
-    probes = scene.probe_positions(seed)
-    states = DoorStates.of(scene, len(probes), seed)
+    probes = scene.probe_positions(seed) if begun is None else begun.probes
+    states = DoorStates.of(scene, len(probes), seed) if begun is None else begun.states
     return PairSimulation.prepare(
         scene, probes, yaws, seed=seed, plan=plan, most_tail_rays=most_tail_rays, states=states
     )
@@ -53,7 +59,7 @@ def simulate(
     calls for are simulated.
 
     The scene is a scene file or the folder of a level. Raises SceneFileError for a bad one, and DatasetError for a
-    folder that contains another scene.
+    folder that contains another scene, or other probes than `simulation`.
     """
     scene = read_scene(scene_path)
     if simulation is not None:
@@ -67,7 +73,9 @@ def simulate(
     task = progress.add_task("simulating", total=len(dataset.probes), completed=len(dataset.probes) - len(remaining))
     if not remaining:
         return dataset
-    simulation = simulation or prepared(scene, seed=seed, plan=plan)
+    simulation = simulation or prepared(scene, seed=seed, plan=plan, begun=dataset)
+    if not np.array_equal(simulation.probes, dataset.probes):
+        raise DatasetError(f"{folder}: was begun with probes at other places; choose an empty folder")
     if simulation.tail is not None:
         dataset.write_tail(simulation.tail)
     with closing(jobs.run(_simulate, simulation, list(_emitters(dataset, remaining)))) as simulated:

@@ -171,6 +171,13 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capfd):
     assert len(list((tmp_path / "baked").iterdir())) == 1
 
 
+def test_a_level_that_is_not_there_makes_no_folder(tmp_path, capfd):
+    code, _, err = bake(tmp_path, capfd)
+    assert code == 2
+    assert "level.glb: file: there is no such file" in err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_level_that_is_refused_says_so_and_can_be_baked_when_mended(tmp_path, capfd):
     write_level(tmp_path / "level.glb", material="M_042")
     code, _, err = bake(tmp_path, capfd)

@@ -19,6 +19,7 @@ from training.cli.main import app
 from training.data.dataset import Dataset, DatasetError
 from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene, SceneDoor, read_scene
 from training.data.levels.probe_places import probe_places
+from training.data.levels.walkable import reached_ground
 from training.data.scene_file import SceneFile, SceneFileError
 from training.parallel.jobs import open_jobs
 from training.simulation.direct_paths import DirectPaths
@@ -133,14 +134,15 @@ def test_a_ramp_that_joins_two_floors_is_none_and_hides_none():
 
 
 def test_places_above_a_slope_have_one_probe_each():
-    """A slope is many floors, each of its own part of the ground."""
+    """A slope is many floors, and one ground."""
     slope = MeshSurroundings(sheets(rectangle((0, 10), (0, 10), 0.0, high_z=1.5)), open_sky=True)
     probes = PROBES.model_copy(update={"spacing_m": 1.0, "jitter_m": 0.1, "heights_m": (1.2, 1.3)})
-    found = probe_places(slope, probes, np.random.default_rng(1))
+    ground = reached_ground(slope, [(5.0, 5.0, 2.0)], ear_m=1.2, head_room_m=1.6)
+    found = probe_places(slope, ground, probes, np.random.default_rng(1))
     assert len(floors_of(slope.mesh)) > 5
     assert 90 <= len(found) <= 110
     above_m = found[:, 2] - 0.15 * found[:, 0]
-    assert np.all((above_m > 0.95) & (above_m < 1.5))
+    assert np.all((above_m > 1.2 - 1e-9) & (above_m < 1.3 + 1e-9))
 
 
 def test_too_many_cells_are_refused_before_any_is_drawn():
@@ -177,6 +179,23 @@ def test_an_interrupted_simulation_goes_on_and_another_level_is_refused(dataset,
         turned.write(tmp_path / "other")
         with pytest.raises(DatasetError, match="holds another scene"):
             simulate(tmp_path / "other", dataset.folder, seed=3, jobs=jobs, progress=progress)
+
+
+def test_a_simulation_that_was_begun_keeps_its_probes(folder, tmp_path, monkeypatch):
+    """Another version of the program may place them elsewhere."""
+    begun = Dataset.create(tmp_path, folder, 3, plan_of_level(level_of()))
+    elsewhere = level_of().probe_positions(4)[: len(begun.probes)]
+    monkeypatch.setattr(LevelScene, "probe_positions", lambda *_: elsewhere)
+    other = prepared(level_of(), seed=3, plan=begun.effects)
+    with open_jobs(None, threads=1) as jobs, Progress(disable=True) as progress:
+        with pytest.raises(DatasetError, match="begun with probes at other places"):
+            simulate(folder, tmp_path, seed=3, jobs=jobs, progress=progress, simulation=other)
+        assert not simulate(folder, tmp_path, seed=3, jobs=jobs, progress=progress).remaining()
+    pair = begun.pairs(held_out=False)[0]
+    kept = prepared(level_of(), seed=3, plan=begun.effects, begun=begun)
+    np.testing.assert_allclose(
+        begun.read_energy(pair[None])[0], kept.energies(pair[0], pair[1:], 0)[0], rtol=0.02, atol=1e-12
+    )
 
 
 def test_a_level_sounds_as_its_plan():

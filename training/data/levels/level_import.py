@@ -307,7 +307,7 @@ def _comments(assignments: Sequence[Assignment]) -> dict[str, str]:
         source = table()[row].source if row in table() else ""
         key = each.name if re.fullmatch(r"[A-Za-z0-9_-]+", each.name) else json.dumps(each.name, ensure_ascii=False)
         comments[f"geometry.materials.{key}"] = f"From {kind}: {row}" + (f" ({source})" if source else "")
-    comments["probes"] = "Heights are above the floor that is below."
+    comments["probes"] = "Heights are above the ground on which a listener walks."
     comments["simulation"] = "The duration is the longest reverberation time by Eyring's formula."
     return comments
 

@@ -1,7 +1,7 @@
 """The folder of an imported level: `scene.toml`, the mesh, and a mesh for each door.
 
 `scene.toml` is a scene file whose geometry is a mesh; its other tables are those of any scene file. Heights of probes
-are above the floor that is below them. Doors stand as they are at the beginning, unless `with_doors` moves them.
+are above the ground that is below them. Doors stand as they are at the beginning, unless `with_doors` moves them.
 """
 
 import hashlib
@@ -27,7 +27,8 @@ from server.scene.door import Door
 from server.scene.geometry import Material, Point, Strict
 from server.scene.manifest import Air, Start
 from server.scene.mesh_geometry import MeshGeometry
-from training.data.levels.probe_places import probe_places
+from training.data.levels.probe_places import probe_places, require_few_cells
+from training.data.levels.walkable import Ground, reached_ground
 from training.data.scene_file import FEWEST_PROBES, Probes, SceneFile, SceneFileError, Simulation
 
 SCENE_FILE, MESH_FILE = "scene.toml", "geometry.npz"
@@ -161,20 +162,35 @@ class LevelScene:
     def sound_paths(self) -> SoundPathFinder:
         return self.surroundings.sound_paths(_SPEED_OF_SOUND)
 
+    @cached_property
+    def ground(self) -> Ground:
+        """Where a listener can walk, from the start, the spawn areas and the emitters on. No door is shut."""
+        geometry, probes = self.file.geometry, self.file.probes
+        areas = [np.mean([area.low, area.high], axis=0).tolist() for area in geometry.spawns]
+        emitters = [self.file.start.emitter, *(emitter.position for emitter in geometry.emitters)]
+        return reached_ground(
+            MeshSurroundings(self.mesh, open_sky=geometry.open_sky),
+            [self.file.start.listener, *areas],
+            emitters,
+            ear_m=probes.heights_m[0],
+            head_room_m=probes.heights_m[0] + probes.wall_clearance_m,
+        )
+
     def probe_positions(self, seed: int) -> _Floats:
-        """(probe, 3) positions in the air above floors; the same for the same seed. Raises SceneFileError if there are
-        too few, or too many cells for them."""
+        """(probe, 3) positions of ears where a listener can walk; the same for the same seed. Raises SceneFileError if
+        there are too few, or too many cells for them."""
         try:
-            places = probe_places(self.surroundings, self.file.probes, np.random.default_rng([seed, 0]))
+            require_few_cells(self.surroundings, self.file.probes)
         except SceneFileError as exc:
             raise SceneFileError(f"{self.id}: {exc}") from exc
+        places = probe_places(self.surroundings, self.ground, self.file.probes, np.random.default_rng([seed, 0]))
         for share in _SWEPT if self.doors else ():
             surroundings = self.with_doors([share] * len(self.doors)).surroundings
             clear = surroundings.tree.distance_m(places) >= self.file.probes.wall_clearance_m
             places = places[clear & surroundings.contains(places)]
         if len(places) < FEWEST_PROBES:
             raise SceneFileError(
-                f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit above the floors, "
+                f"{self.id}: probes.spacing_m: fewer than {FEWEST_PROBES} probes fit where a listener can walk, "
                 f"{self.file.probes.spacing_m:g} m apart and {self.file.probes.wall_clearance_m:g} m from all surfaces "
                 "(probes.wall_clearance_m)"
             )

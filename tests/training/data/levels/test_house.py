@@ -71,6 +71,17 @@ def test_nothing_but_its_rooms_is_air(make, imported, is_open):
     np.testing.assert_array_equal(found, air)
 
 
+def test_probes_stand_in_every_room_and_on_the_stairs(make, imported):
+    probes = imported.scene.probe_positions(0)
+    assert 100 < len(probes) < 140
+    for room in make.ROOMS[:2] + make.ROOMS[3:8]:
+        ends = np.array(room.ends)
+        assert ((probes > ends[:, 0]) & (probes < ends[:, 1])).all(axis=1).sum() > 3
+    heights_m = probes[(probes[:, 0] > 5) & (probes[:, 0] < 6) & (probes[:, 1] > 3.25) & (probes[:, 1] < 6), 2]
+    assert heights_m.min() < 2.6
+    assert heights_m.max() > make.FLOOR_2_M + 1
+
+
 def test_trimesh_finds_it_watertight_too():
     mesh = trimesh.load_scene(HOUSE / "house.glb")
     still = [
