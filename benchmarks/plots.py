@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 from benchmarks.record import Result, Table
+from server.acoustics.metrics import PARAMETER_METRICS
 from server.bench.history import Run
 from server.planning.plan_figure import figure_of
 from server.planning.plan_query import PlanDocument
@@ -152,6 +153,53 @@ def held_back_losses(result: Result) -> Figure:
     return figure
 
 
+def errors_of_meshes(result: Result) -> Figure:
+    """Draw the error of each scene as a mesh over the floor, and the range of chance, a panel per metric."""
+    ratios = result.values["ratios"]
+    assert isinstance(ratios, dict)
+    names = list(next(iter(ratios.values())))
+    figure = Figure(figsize=(10.0, 5.6), layout="constrained", facecolor="white")
+    panels = figure.subplots(2, -(-len(names) // 2), sharex=True, sharey=True).ravel()
+    for axes, name in zip(panels, names, strict=True):
+        values, low, high = np.array([[float(number) for number in of[name]] for of in ratios.values()]).T
+        at = np.arange(len(values))
+        axes.vlines(at, low, high, color=_OTHER, linewidth=7, label="nine in ten by chance, if both were the same")
+        axes.axhline(1.0, color=_FLOOR, linestyle="--", linewidth=1.2, label="a take of the plan (floor)")
+        axes.plot(at, values, "o", color=_FIRST, label="a take of the mesh, from one of the plan")
+        (metric,) = (each for each in PARAMETER_METRICS if each.name == name)
+        axes.set_title(metric.label, fontsize=11, color=_TEXT)
+        axes.set_xticks(at, list(ratios), rotation=30, ha="right", fontsize=9)
+        axes.set_ylim(0, 2)
+        _bare(axes)
+    for axes in panels[:: len(panels) // 2]:
+        axes.set_ylabel("mean error, times the floor", color=_TEXT)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    return figure
+
+
+def losses_at_a_screen(result: Result) -> Figure:
+    """Draw the loss at the edge of a screen over the Fresnel number."""
+    table = result.tables["screen"]
+    numbers = table.column("Fresnel number")
+    figure, axes = _one_panel(7.5, 4.6)
+    styles = {
+        "mesh, dB": ("o-", _FIRST, "mesh"),
+        "Maekawa, dB": ("s", "#d1495b", "measured by Maekawa"),
+        "rigid half-plane, dB": ("--", "#66a182", "half-plane that reflects everything"),
+        "absorbing half-plane, dB": (":", "#edae49", "half-plane that reflects nothing"),
+    }
+    for title, (style, colour, label) in styles.items():
+        losses = table.column(title)
+        known = [(number, loss) for number, loss in zip(numbers, losses, strict=True) if loss is not None]
+        axes.plot(*zip(*known, strict=True), style, color=colour, label=label, markersize=6)
+    axes.set_xscale("symlog", linthresh=0.1)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set(xlabel="Fresnel number; below zero, the two are in sight of each other", ylabel="loss, dB")
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
 def pictures_side_by_side(result: Result) -> Figure:
     """Show the true pictures and those of each method, a column each."""
     titles, stored = result.values["columns"], result.values["png"]
@@ -210,6 +258,15 @@ def _bare(axes: Axes) -> None:
 
 PLOTS: Final[Mapping[str, Callable[[Result], Figure]]] = {
     each.__name__: each
-    for each in (plan_of_effects, error_over_time, times_floor, fractions, held_back_losses, pictures_side_by_side)
+    for each in (
+        plan_of_effects,
+        error_over_time,
+        times_floor,
+        fractions,
+        held_back_losses,
+        errors_of_meshes,
+        losses_at_a_screen,
+        pictures_side_by_side,
+    )
 }
 """Functions that draw a plot, by the name used in results."""

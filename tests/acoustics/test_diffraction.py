@@ -8,25 +8,12 @@ from server.acoustics import diffraction
 from server.acoustics.decibels import amplitude_to_db
 from server.acoustics.diffraction import CLEAR_FRESNEL_NUMBER
 from tests.oracles.sound_path import diffraction_gain_db as gain_db_by_numpy
+from training.trials.edge_theories import MAEKAWA_LOSS_DB
 
 diffraction_gain_db = np.vectorize(diffraction.diffraction_gain_db, otypes=[float])
 
 
-# Read off the measured curve of Maekawa, "Noise reduction by screens", Applied Acoustics 1 (1968), figure 3.
-@pytest.mark.parametrize(
-    ("fresnel_number", "loss_db"),
-    [
-        (-0.3, 0.0),
-        (-0.1, 2.8),
-        (0.0, 5.0),
-        (0.1, 7.5),
-        (0.5, 11.0),
-        (1.0, 13.0),
-        (3.0, 17.5),
-        (10.0, 23.0),
-        (100.0, 33.0),
-    ],
-)
+@pytest.mark.parametrize(("fresnel_number", "loss_db"), MAEKAWA_LOSS_DB.items())
 def test_agrees_with_the_chart(fresnel_number: float, loss_db: float) -> None:
     assert abs(diffraction_gain_db(fresnel_number) + loss_db) < 1.0
 

@@ -18,6 +18,7 @@ from server.acoustics.room_parameters import RoomParameters, measure
 from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER
 from training.data.scene_file import SceneFile
+from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.direct_paths import DirectPaths
 from training.simulation.pairs import PairSimulation
@@ -113,7 +114,7 @@ class GeometricResponses:
     """Computes the direct sound and the first reflections, which datasets do not store, at the orientations that are
     compared."""
 
-    def __init__(self, scene: SceneFile, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
+    def __init__(self, scene: SimulatedScene, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
         settings = scene.simulation
         samples = round(settings.duration_s * settings.sample_rate)
         directions = sphere_directions(settings.arrival_directions)

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.decibels import db_to_power, power_to_db
-from server.scene.geometry import Geometry, Material
+from server.scene.geometry import Geometry
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.diffuse_room import DiffuseRoom
 from training.simulation.rays import RayTracer, sphere_directions
+from training.trials.other_rays import OtherRays
 
 _Floats = npt.NDArray[np.float64]
 
@@ -41,7 +41,6 @@ _EMITTERS, _RECEIVERS = 1, 5
 _RUNS, _RAYS, _MOST_RAYS, _MORE = 5, 10_000, 160_000, 4
 _SURE = 0.01
 _FITTED_DB = -5.0, -35.0
-_RADIUS_M = 0.4
 # With less scattering than a third, the two definitions describe different rooms.
 _ALIKE_SCATTERING = 1 / 3
 
@@ -190,48 +189,11 @@ def _ours_s(scene: SceneFile, geometry: Geometry, emitters: _Floats, receivers: 
 
 
 def _others_s(scene: SceneFile, geometry: Geometry, emitters: _Floats, receivers: _Floats) -> _Floats:
-    import pyroomacoustics as pra
-
-    def material(of: Material) -> "pra.Material":
-        absorption, scattering = (
-            {"coeffs": list(shares), "center_freqs": list(OCTAVE_BANDS_HZ)} for shares in (of.absorption, of.scattering)
-        )
-        return pra.Material(absorption, scattering)
-
-    bins = round(scene.simulation.duration_s / HISTOGRAM_BIN_S)
-    room = pra.Room.from_corners(
-        np.array(geometry.corners).T,
-        fs=24_000,  # at this rate its octave bands are ours, and its bins
-        max_order=1,
-        materials=material(geometry.materials.walls),
-        ray_tracing=True,
-    )
-    caps = {name: material(getattr(geometry.materials, name)) for name in ("floor", "ceiling")}
-    room.extrude(geometry.height_m, materials=caps)
-    room.set_ray_tracing(
-        receiver_radius=_RADIUS_M,
-        energy_thres=1e-12,
-        time_thres=scene.simulation.duration_s,
-        hist_bin_size=HISTOGRAM_BIN_S,
-    )
-    room.add_microphone_array(receivers.T)
+    others = OtherRays(geometry, receivers, image_order=0, duration_s=scene.simulation.duration_s)
 
     def times_s(run: int, rays: int) -> _Floats:
         rng = np.random.default_rng([run, 11])
-        total = np.zeros((len(OCTAVE_BANDS_HZ), bins))
-        for emitter in emitters:
-            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-            directions = (sphere_directions(rays) @ turn).astype(np.float32)
-            # Its public class would draw the direct path through walls.
-            engine = room.room_engine
-            engine.image_source_model(emitter.astype(np.float32))
-            engine.reset_mics()
-            engine.ray_tracing(
-                directions, np.ones((rays, len(OCTAVE_BANDS_HZ)), np.float32), emitter.astype(np.float32)
-            )
-            for microphone in engine.microphones:
-                energy = microphone.histograms[0].get_hist()[:, :bins]
-                total[:, : energy.shape[1]] += energy
-        return reverberation_time_s(_in_air(scene, total))
+        energy = sum(others.energy(emitter, rays, rng).sum(axis=0) for emitter in emitters)
+        return reverberation_time_s(_in_air(scene, energy))
 
     return median_of_runs(times_s)

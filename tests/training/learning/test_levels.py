@@ -11,12 +11,11 @@ from server.acoustics.geometry import FloorPlan
 from server.field.fields_by_level import FieldsByLevel
 from server.responses.full_response import FullResponse
 from server.scene.bundle import BUNDLED, Bundle
-from server.scene.mesh_geometry import MeshGeometry
 from training.baselines.held_out import open_held_out, require_same_scene
 from training.bundling.export import export
 from training.data.dataset import Dataset
 from training.data.dataset_check import DatasetError
-from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFile
 from training.frontier.accuracy import SampledPairs
 from training.learning.runs import RunError, configure
@@ -34,18 +33,14 @@ QUIET = Progress(disable=True)
 
 def level() -> LevelScene:
     """The apartment as a mesh, with few probes and rays."""
-    place = MeshGeometry.of_plan(APARTMENT.geometry)
     brief = {"rays": 300, "duration_s": 0.25, "arrival_directions": 6, "yaws": 1, "sample_rate": 16_000}
-    file = LevelFile(
-        id="level",
-        name="The apartment",
-        description="",
-        geometry=LevelGeometry(mesh="geometry.npz", materials=dict(place.materials)),
-        start=APARTMENT.start,
-        probes=APARTMENT.probes.model_copy(update={"spacing_m": 2.0, "wall_clearance_m": 0.3}),
-        simulation=APARTMENT.simulation.model_copy(update=brief),
-    )
-    return LevelScene(file, place.mesh, ())
+    few = {"spacing_m": 2.0, "wall_clearance_m": 0.3}
+    settings = {
+        "id": "level",
+        "probes": APARTMENT.probes.model_copy(update=few),
+        "simulation": APARTMENT.simulation.model_copy(update=brief),
+    }
+    return LevelScene.of_plan(APARTMENT.model_copy(update=settings))
 
 
 @pytest.fixture(scope="module")

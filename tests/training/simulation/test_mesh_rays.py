@@ -7,50 +7,16 @@ import numpy as np
 import pytest
 
 from server.acoustics.decibels import power_to_db
-from server.acoustics.mesh import TriangleMesh
 from server.acoustics.mesh_tree import MeshTree
 from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
 from training.simulation.mesh_rays import MeshRayTracer
 from training.simulation.rays import RayTracer, sphere_directions
+from training.trials.mesh_rooms import CUBE, INWARDS, PANEL, ROUGH, house, material, place_of, two_rooms
 
 SCENES = Path(__file__).resolve().parents[3] / "training" / "scenes"
-QUADS = ((0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5))
-CUBE = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
-INWARDS = np.array([(q[0], q[a], q[a + 1]) for q in QUADS for a in (1, 2)])
-MUTE, MIRROR, ROUGH = "mute", "mirror", "rough"
-
-
-def material(absorption, scattering):
-    return Material(absorption=(absorption,) * 7, scattering=(scattering,) * 7)
-
-
-def place_of(*parts, **materials):
-    """Parts are (vertices, triangles, name of a material)."""
-    names, vertices, triangles, surfaces = tuple(materials), [], [], []
-    for corners, faces, name in parts:
-        triangles.append(np.asarray(faces) + sum(map(len, vertices)))
-        vertices.append(np.asarray(corners, dtype=float))
-        surfaces.append(np.full(len(faces), names.index(name)))
-    mesh = TriangleMesh(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(surfaces), names)
-    return MeshGeometry(mesh, materials)
-
-
-def house(absorption, scattering):
-    """A room of 5 x 4 m under a gabled roof, 2.5 m high at the eaves and 4 m at the ridge, with a block in it."""
-    profile = np.array([(0, 0), (4, 0), (4, 2.5), (2, 4), (0, 2.5)], dtype=float)
-    ends = [np.column_stack([np.full(5, x), profile]) for x in (0.0, 5.0)]
-    gable = np.array([(0, 1, 2), (0, 2, 4), (2, 3, 4)])
-    here, after = np.arange(5), np.roll(np.arange(5), -1)
-    sides = [(a, b, b + 5) for a, b in zip(here, after, strict=True)]
-    sides += [(a, b + 5, a + 5) for a, b in zip(here, after, strict=True)]
-    shell = np.concatenate([gable, gable[:, ::-1] + 5, np.array(sides)[:, ::-1]])
-    block = CUBE * (1.5, 1.0, 0.8) + (2.5, 0.7, 0.9)
-    of_all = material(absorption, scattering)
-    return place_of((np.concatenate(ends), shell, ROUGH), (block, INWARDS[:, ::-1], ROUGH), **{ROUGH: of_all})
-
-
+MUTE, MIRROR = "mute", "mirror"
 EMITTER, RECEIVERS = np.array([1.0, 1.0, 1.2]), np.array([(4.4, 3.2, 1.4), (1.2, 3.0, 2.9), (4.0, 2.6, 2.4)])
 
 
@@ -235,24 +201,6 @@ def test_a_material_may_be_changed_for_all_triangles_of_its_name():
     quieter = replace(place, materials={ROUGH: material(0.9, 0.5)})
     loud, quiet = (traced(each, EMITTER, RECEIVERS).sum() for each in (place, quieter))
     assert power_to_db(quiet / loud) < -8
-
-
-PANEL, LINING = "panel", "lining"
-
-
-def two_rooms(*, wall_m, absorption, panel, lining=None):
-    """Rooms of 3 x 3 x 2.5 m and 4 x 3 x 2.5 m, and a wall between them: a sheet, or `wall_m` thick. Its sides are of
-    PANEL, or the second one of LINING. What goes into a thick wall at its edge leaves it outside of the rooms."""
-    rooms = [(CUBE * (size_x, 3, 2.5) + (x, 0, 0)) for size_x, x in ((3, 0), (4, 3 + wall_m))]
-    west, east = INWARDS[[0, 1]], INWARDS[[2, 3]]
-    rest = [np.delete(INWARDS, at, axis=0) for at in ((2, 3), (0, 1))]
-    materials = {ROUGH: material(absorption, 1.0), PANEL: panel, LINING: lining or panel}
-    for faces, x in ((west, 0), (east, 1)):
-        assert np.all(CUBE[faces][..., 0] == x)
-    second = [(rooms[1], west, LINING if lining else PANEL)] if wall_m else []
-    return place_of(
-        (rooms[0], rest[0], ROUGH), (rooms[1], rest[1], ROUGH), (rooms[0], east, PANEL), *second, **materials
-    )
 
 
 def losses_db(*of_materials):

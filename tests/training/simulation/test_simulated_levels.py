@@ -17,7 +17,7 @@ from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
 from training.data.dataset import Dataset, DatasetError
-from training.data.levels.level_scene import LevelFile, LevelGeometry, LevelScene, SceneDoor, read_scene
+from training.data.levels.level_scene import LevelScene, SceneDoor, read_scene
 from training.data.levels.probe_places import probe_places
 from training.data.levels.walkable import reached_ground
 from training.data.scene_file import SceneFile, SceneFileError
@@ -37,18 +37,9 @@ PROBES = APARTMENT.probes.model_copy(update={"spacing_m": 2.0, "wall_clearance_m
 
 
 def level_of(doors=(), leaves=()):
-    place = MeshGeometry.of_plan(APARTMENT.geometry)
-    geometry = LevelGeometry(mesh="geometry.npz", materials=dict(place.materials), doors=doors)
-    file = LevelFile(
-        id="level",
-        name="The apartment",
-        description="",
-        geometry=geometry,
-        start=APARTMENT.start,
-        probes=PROBES,
-        simulation=BRIEF,
-    )
-    return LevelScene(file, place.mesh, leaves)
+    base = LevelScene.of_plan(APARTMENT.model_copy(update={"id": "level", "probes": PROBES, "simulation": BRIEF}))
+    geometry = base.file.geometry.model_copy(update={"doors": doors})
+    return LevelScene(base.file.model_copy(update={"geometry": geometry}), base.mesh, leaves)
 
 
 @pytest.fixture(scope="module")

@@ -233,6 +233,23 @@ class LevelScene:
             raise SceneFileError(f"{path}: geometry.doors: with their leaves where they stand, {exc}") from exc
         return scene
 
+    @classmethod
+    def of_plan(cls, scene: SceneFile) -> "LevelScene":
+        """A scene's floor plan as a closed mesh, with the scene's air, probes and settings. What its openings are
+        called is lost, and so is what it says of effects."""
+        place = MeshGeometry.of_plan(scene.geometry)
+        file = LevelFile(
+            id=scene.id,
+            name=scene.name,
+            description=scene.description,
+            geometry=LevelGeometry(mesh=MESH_FILE, materials=dict(place.materials)),
+            air=scene.air,
+            start=scene.start,
+            probes=scene.probes,
+            simulation=scene.simulation,
+        )
+        return cls(file, place.mesh, ())
+
     def copy_meshes(self, source: Path, folder: Path) -> None:
         """Copy the meshes, but not the scene file, from one folder to another."""
         for name in (self.file.geometry.mesh, *(door.mesh for door in self.file.geometry.doors)):
