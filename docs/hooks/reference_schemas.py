@@ -12,6 +12,7 @@ from server.scene import geometry
 from server.scene import manifest as manifests
 
 _OF_THE_HOST: Final = {
+    "cores": "the processor cores that the process may use",
     "audio_threads": "the processor cores that the process may use",
     "ir_workers": "one less than `NAFIR_AUDIO_THREADS`, and at least 1",
 }

@@ -44,7 +44,7 @@ from server.api.problems import problem
 from server.api.process_peers import AskedStream, MovedStream, ProcessPeers, ToldStream, random_token
 from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
-from server.api.settings import Settings, usable_cores
+from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
 from server.api.turn_taking import OneAtATime
 from server.api.uploads import Uploads
@@ -302,7 +302,7 @@ class StreamHost:
         self.admission = Admission(
             self.audio,
             most_streams=self.settings.max_streams,
-            cores=usable_cores(),
+            cores=self.settings.cores,
             is_on=self.settings.admission,
             thresholds=dataclasses.replace(THRESHOLDS, ir_share=self.settings.ir_share),
         )

@@ -147,6 +147,8 @@ class Settings(BaseSettings):
     processes: Annotated[int, Field(ge=1)] = 1
     """Processes that serve at the port, each on an equal part of the cores. All other settings hold for each of
     them."""
+    cores: Annotated[int, Field(ge=1)] = usable_cores()
+    """Cores that streams may take together: fewer than the machine has where others use it too."""
     audio_threads: Annotated[int, Field(ge=1)] = usable_cores()
     """Threads that render streams."""
     realtime: bool = True

@@ -37,7 +37,8 @@ def is_ending() -> bool:
 def threads_of(cores: float) -> dict[str, int]:
     """Settings for a replica that has so many cores, as far as the environment does not say otherwise. One that is
     alone on a machine would take all of them."""
-    usual = {"audio_threads": max(1, int(cores)), "ir_workers": max(1, int(cores) - 1)}
+    whole = max(1, int(cores))
+    usual = {"cores": whole, "audio_threads": whole, "ir_workers": max(1, whole - 1)}
     return {name: value for name, value in usual.items() if f"NAFIR_{name}".upper() not in os.environ}
 
 
