@@ -160,8 +160,9 @@ poses come directly after one another, the server may read only the newest.
 
 **Errors.** A refused message changes nothing, and the stream goes on, unless it was the hello. An `error` that ends the
 connection is followed by a close frame whose reason is the error's code. A server that shuts down sends every stream
-a `snapshot`, if it gives any, and the error `server_draining` with the seconds until it has ended (`retry_after_s`),
-and closes it with 1012; the client may resume or open it again, there or elsewhere.
+a `snapshot`, if it gives any, and the error `server_draining` with the seconds until it has ended (`retry_after_s`;
+without them another server takes the stream at once), and closes it with 1012; the client may resume or open it again,
+there or elsewhere.
 
 **An exchange**
 

@@ -532,15 +532,16 @@ class Connection:
         if drain.has_begun:
             return self._draining()
         try:
-            return await run_until(self._serve(), drain.begun())
+            return await run_until(self._serve(), drain.turn())
         except StoppedError:
             return self._draining()
 
     def _draining(self) -> Goodbye:
         """What a client is told during the shutdown: how long it lasts, and how to go on."""
-        seconds = self._host.readiness.drain.retry_after_s
+        seconds = self._host.readiness.drain.streams_retry_after_s
         how = "open the stream again" if self._parting is None else "resume with the snapshot"
-        message = f"the server is shutting down: {how}, at another or here in {seconds} s"
+        where = "another takes it now" if seconds is None else f"at another or here in {seconds} s"
+        message = f"the server is shutting down: {how}, {where}"
         return Goodbye(SERVICE_RESTART, Error(code="server_draining", message=message, retry_after_s=seconds))
 
     async def _serve(self) -> Goodbye | None:
@@ -551,6 +552,8 @@ class Connection:
         first = await self._receive_first()
         if isinstance(first, Goodbye):
             return first
+        if host.readiness.drain.has_begun:
+            return self._draining()
         if isinstance(first, Hello):
             return await self._serve_stream(first, None)
         try:

@@ -2,8 +2,8 @@
 
 It differs from a single server in three ways. It is started only when it is warmed up, so that no client is sent to a
 replica that refuses it. State that an application shares with its requests is handed to them here, since a router does
-not. And it can be asked how much of it is free, and told to drain: then every stream ends on a block with
-`server_draining`, and clients come back to another replica.
+not. And it can be asked how much of it is free, and told to drain: then one stream after the other ends on a block with
+`server_draining`, and its client comes back at once, to another replica.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ class ReplicaApp:
 
     def __init__(self, settings: Settings, *, build: Callable[..., App] = create_app) -> None:
         """`build` takes the settings and a `drain`, and makes the application."""
-        self._drain = Drain(settings.drain_s)
+        self._drain = Drain(settings.drain_s, in_turn=True)
         self._app = build(settings, drain=self._drain)
         self._state: dict[str, Any] = {}
 
@@ -80,6 +80,11 @@ class ReplicaApp:
         """Share of the replica, from 0 to 1, that is free for more streams."""
         return self._host.admission.headroom
 
+    @property
+    def streams(self) -> int:
+        """Streams that are open, or being opened."""
+        return self._host.admission.streams
+
     def begin_drain(self) -> None:
-        """Accept nothing new, and tell all streams."""
+        """Accept nothing new, and end one stream after the other."""
         self._drain.begin()

@@ -14,13 +14,19 @@ _FOR_REQUESTS = 0.7
 """Share of the drain time after which open requests are answered with 503."""
 _FOR_ANSWERS = 0.85
 """Share of the drain time after which the server stops waiting for clients to read those answers."""
+_FOR_STREAMS = 0.5
+"""Share of the drain time in which streams end one after the other, where others take them."""
 
 
 class Drain:
-    """A shutdown that takes at most `drain_s` seconds."""
+    """A shutdown that takes at most `drain_s` seconds. Streams end at once, or `in_turn`, if other servers take them
+    meanwhile: all at once would be more than these can let in."""
 
-    def __init__(self, drain_s: float, *, time_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, drain_s: float, *, in_turn: bool = False, time_s: Callable[[], float] = time.monotonic) -> None:
         self.drain_s = drain_s
+        self._spread_s = _FOR_STREAMS * drain_s if in_turn else 0.0
+        self._streams: dict[object, float] = {}
+        """Seconds from the beginning to the turn of each stream."""
         self._time_s = time_s
         self._began_s: float | None = None
         self._has_begun = asyncio.Event()
@@ -39,15 +45,28 @@ class Drain:
         passed_s = 0.0 if self._began_s is None else self._time_s() - self._began_s
         return max(1, math.ceil(self.drain_s - passed_s))
 
+    @property
+    def streams_retry_after_s(self) -> int | None:
+        """The same for streams; None if others take them at once."""
+        return None if self._spread_s else self.retry_after_s
+
     def begin(self) -> None:
         """Accept nothing new from now on. A second call changes nothing."""
         if self._began_s is None:
             self._began_s = self._time_s()
+            step_s = self._spread_s / max(1, len(self._streams))
+            self._streams = {stream: number * step_s for number, stream in enumerate(self._streams)}
             self._has_begun.set()
 
-    async def begun(self) -> None:
-        """Return once the shutdown has begun."""
-        await self._has_begun.wait()
+    async def turn(self) -> None:
+        """Return when the stream that awaits this has to end."""
+        stream = object()
+        self._streams[stream] = 0.0
+        try:
+            await self._has_begun.wait()
+            await asyncio.sleep(self._streams[stream])
+        finally:
+            del self._streams[stream]
 
     async def out_of_time(self) -> None:
         """Return once the time for open requests is over."""

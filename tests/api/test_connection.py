@@ -496,6 +496,40 @@ def test_a_stream_is_told_when_the_server_ends_and_so_is_who_has_not_said_hello_
         assert socket.sent[-1].code == "server_draining"
 
 
+def test_where_others_take_its_streams_a_server_plays_each_until_its_turn_and_opens_no_more(field, hrtfs):
+    async def scenario():
+        first, second, late = Socket(), Socket(), Socket()
+        async with hosting(field, hrtfs) as host:
+            host.readiness.drain = Drain(60.0, in_turn=True)
+            running = [asyncio.create_task(Connection(socket, host).run()) for socket in (first, second, late)]
+            for socket in (first, second):
+                socket.say(HELLO)
+                await asyncio.wait_for(socket.has_sent.wait(), 5)
+            host.readiness.drain.begin()
+            await asyncio.wait_for(running[0], 5)
+            late.say(HELLO)
+            await asyncio.wait_for(running[2], 5)
+            assert not running[1].done()
+            assert len(host.audio.streams) == 1
+            running[1].cancel()
+            await asyncio.wait({running[1]})
+        return first, late
+
+    for socket in asyncio.run(scenario()):
+        assert socket.close_code == 1012
+        error = socket.sent[-1]
+        assert (error.code, error.retry_after_s) == ("server_draining", None)
+        assert "another takes it now" in error.message
+
+
+def test_streams_are_let_in_by_the_cores_of_the_settings(field, hrtfs):
+    async def scenario():
+        async with hosting(field, hrtfs, cores=3) as host:
+            return host.admission.load().cores
+
+    assert asyncio.run(scenario()) == 3
+
+
 def test_a_client_that_does_not_read_keeps_the_server_from_ending_for_a_moment_only(field, hrtfs):
     async def scenario():
         socket = Socket()

@@ -113,10 +113,31 @@ def test_its_drain_is_the_applications_and_no_reason_to_replace_it() -> None:
     run(drains)
 
 
+def test_its_streams_end_one_after_the_other_and_are_taken_by_others_at_once() -> None:
+    async def drains(server, app, _):
+        await _started(server)
+        drain, ended = server.host.readiness.drain, []
+
+        async def stream(number):
+            await drain.turn()
+            ended.append(number)
+
+        streams = [asyncio.create_task(stream(number)) for number in range(4)]
+        await asyncio.sleep(0.1)
+        app.begin_drain()
+        await asyncio.sleep(0.1)  # the next has its turn a second later
+        assert ended == [0]
+        assert drain.streams_retry_after_s is None
+        for task in streams:
+            task.cancel()
+
+    run(drains)
+
+
 def test_it_says_how_much_of_it_is_free() -> None:
     async def measures(server, app, _):
         await _started(server)
-        server.host.admission = SimpleNamespace(headroom=0.25)
-        assert app.headroom == 0.25
+        server.host.admission = SimpleNamespace(headroom=0.25, streams=7)
+        assert (app.headroom, app.streams) == (0.25, 7)
 
     run(measures)

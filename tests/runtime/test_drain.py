@@ -73,16 +73,37 @@ def test_who_asks_again_is_told_when_the_server_will_be_gone():
     assert drain.retry_after_s == 1
 
 
-def test_those_who_wait_for_its_beginning_are_woken():
-    async def scenario():
-        drain = Drain(8.0)
-        waiting = asyncio.create_task(drain.begun())
-        await asyncio.sleep(0.01)
-        assert not waiting.done()
-        drain.begin()
-        await asyncio.wait_for(waiting, 1)
+async def ends_s(drain, streams):
+    """Seconds from the beginning of a shutdown after which each of so many streams has its turn."""
+    turns_s = []
 
-    asyncio.run(scenario())
+    async def stream():
+        await drain.turn()
+        turns_s.append(time.monotonic() - began_s)
+
+    tasks = [asyncio.create_task(stream()) for _ in range(streams)]
+    await asyncio.sleep(0.01)
+    assert not turns_s
+    began_s = time.monotonic()
+    drain.begin()
+    await asyncio.gather(*tasks)
+    return turns_s
+
+
+def test_streams_end_as_it_begins():
+    assert max(asyncio.run(ends_s(Drain(60.0), 20))) < 5
+
+
+def test_where_others_take_them_streams_end_one_after_the_other_in_half_of_the_time():
+    turns_s = asyncio.run(ends_s(Drain(2.0, in_turn=True), 4))
+    assert [turn_s >= 0.249 * number for number, turn_s in enumerate(turns_s)] == [True] * 4
+    assert turns_s == sorted(turns_s)
+
+
+def test_streams_are_told_to_wait_for_a_server_that_comes_back_and_not_for_others():
+    assert Drain(8.0).streams_retry_after_s == 8
+    assert Drain(8.0, in_turn=True).streams_retry_after_s is None
+    assert Drain(8.0, in_turn=True).retry_after_s == 8
 
 
 @pytest.mark.parametrize("failure", [KeyError, asyncio.CancelledError])
