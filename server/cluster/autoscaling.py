@@ -8,8 +8,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-HEADROOM = "headroom"
-"""The name of a replica's measurement: the share of it that is free for more streams, from 0 to 1."""
+from server.cluster.replica_room import HEADROOM
+
 FREE = 1 / 3
 """Share of all replicas together that stays free: for newcomers while another replica starts, which takes a minute, and
 for the streams of a replica that is lost."""

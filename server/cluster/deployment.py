@@ -1,7 +1,8 @@
 """The server as a deployment of Ray Serve: `serve.yaml` names `server.cluster.deployment:application`.
 
 A replica is the application of one server, in a process of its own, with the settings of its environment. All replicas
-of an application have the same scenes, each loaded once; a router sends a stream to one that has few. Scenes that are
+of an application have the same scenes, each loaded once; a router (`server.cluster.routing`) sends a stream to one that
+has room. Scenes that are
 too many for one process are divided into several applications, each with its own route.
 
 Ray tells a replica nothing when it is to end: it waits for its requests and then ends the process. Streams have no end
@@ -13,8 +14,8 @@ import os
 from typing import Any
 
 from server.api.settings import settings_of
-from server.cluster.autoscaling import HEADROOM
 from server.cluster.replica_app import ReplicaApp
+from server.cluster.replica_room import HEADROOM, STREAMS
 from server.core.errors import NafirError
 
 try:
@@ -60,6 +61,10 @@ class Replica:
 
     async def record_autoscaling_stats(self) -> dict[str, float]:
         return {HEADROOM: self._app.headroom}
+
+    async def record_routing_stats(self) -> dict[str, float]:
+        # Rounded, since Ray tells all proxies of each change.
+        return {HEADROOM: round(self._app.headroom, 2), STREAMS: self._app.streams}
 
     async def check_health(self) -> None:
         """Raises ReplicaError if the replica is to be replaced."""

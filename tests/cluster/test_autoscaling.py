@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from server.cluster.autoscaling import FREE, HEADROOM, by_headroom
+from server.cluster.autoscaling import FREE, by_headroom
+from server.cluster.replica_room import HEADROOM
 
 
 def wanted(*headrooms: float, target: int = 1) -> int:
