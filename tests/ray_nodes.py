@@ -4,7 +4,7 @@ loopback interface. The test belongs to the first node, which is the head; the o
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
@@ -46,8 +46,11 @@ def ray_nodes(*cores: int, environment: Mapping[str, str] = MappingProxyType({})
                 _start(cluster, num_cpus=count, node_ip_address=address, **options, **only_first)
         yield cluster
     finally:
-        for each in [*cluster.worker_nodes, *([cluster.head_node] if cluster.head_node else [])]:
+        nodes = [*cluster.worker_nodes, *([cluster.head_node] if cluster.head_node else [])]
+        started = [process for node in nodes for process in _processes(node)]
+        for each in nodes:
             cluster.remove_node(each, allow_graceful=False)
+        _end(started)
 
 
 def _start(cluster: Any, **options: Any) -> None:
@@ -58,3 +61,22 @@ def _start(cluster: Any, **options: Any) -> None:
         except Exception:  # of a node that ends too soon, Ray raises no narrower one
             if not left:
                 raise
+
+
+def _processes(node: Any) -> list[Any]:
+    """What the processes of a node have started in turn: agents and workers."""
+    import psutil  # the one that comes with Ray
+
+    own = [process.process.pid for each in node.all_processes.values() for process in each]
+    return [child for pid in own if psutil.pid_exists(pid) for child in psutil.Process(pid).children(recursive=True)]
+
+
+def _end(processes: list[Any]) -> None:
+    """End what is left of a cluster. Agents would look for the head for minutes."""
+    import psutil
+
+    _, alive = psutil.wait_procs(processes, timeout=2)
+    for process in alive:
+        with suppress(psutil.NoSuchProcess):  # a process is known by its start, too, and not by its number alone
+            process.kill()
+    psutil.wait_procs(alive, timeout=10)
