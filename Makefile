@@ -54,7 +54,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
+.PHONY: help serve test test-untimed lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
 .PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor audit deploy-check
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
@@ -64,9 +64,13 @@ help: ## show this list
 serve: $(VENV)/installed-server ## install the server and open a scene at http://127.0.0.1:8000 (HOST=, PORT=)
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
 
-test: lint ## install what tests need, then lint, check types and run all tests but the long
-	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long and not cluster'
+test: $(VENV)/installed-dev ## install what tests need, then lint, check types and run all tests but the long
+	$(MAKE) --jobs=2 lint test-untimed
 	$(BIN)/pytest $(TIMED) -m 'timed and not attack and not long and not cluster'
+
+# What watches no clock runs beside others, and beside mypy, which uses one core.
+test-untimed: $(VENV)/installed-dev
+	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long and not cluster'
 
 lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .
