@@ -96,7 +96,7 @@ def measure(sizes: Sizes, say: Callable[[str], None], *, seed: int = 0, threads:
         "L": l_plan,
         "gabled house": house,
     }
-    fewer = replace(laws, rays=laws.rays // 2)  # pyroomacoustics takes long where walls are triangles
+    fewer = replace(laws, rays=laws.rays // 3)  # pyroomacoustics takes long where walls are triangles
     others = [
         partial(beside_others, name, walls[name](_OTHERS_ABSORPTION, scattering), scattering, fewer, rng)
         for (name, scattering), rng in zip(product(walls, (0.0, 1.0)), numbers(1, 6), strict=True)
@@ -280,7 +280,7 @@ def _reciprocities(found: Sequence[Reciprocity]) -> Table:
         (each.place, each.pairs, f"{each.rays:,}", _number(each.there_and_back_db, 2), _number(each.twice_db, 2))
         for each in found
     ]
-    return _table(["place", "pairs", "rays", "there and back, dB", "twice there, dB"], rows, numbers_from=1)
+    return _table(["place", "pairs", "rays", "there and back, dB", "twice one way, dB"], rows, numbers_from=1)
 
 
 def _slits(slits: Sequence[Slit]) -> Table:

@@ -65,7 +65,7 @@ def test_everything_is_measured_with_few_rays_and_drawn(tmp_path: Path) -> None:
     assert said[0].startswith("plans as meshes: 1 of 2, ")
     found = result(measured, tmp_path)
     assert {name: len(table.rows) for name, table in found.tables.items()} == {
-        "plans": 4, "ratios": 3, "shifts": 3, "images": 3, "pyroomacoustics": 6, "eyring": 9, "laws": 13,
+        "plans": 4, "ratios": 3, "shifts": 3, "images": 3, "pyroomacoustics": 6, "eyring": 9, "laws": 12,
         "reciprocity": 3, "slits": 3, "screen": 9, "hidden": 2,
     }  # fmt: skip
     for plot in (errors_of_meshes, losses_at_a_screen):

@@ -14,7 +14,7 @@ from training.trials.mesh_laws import LAWS, RECIPROCITIES, Sizes, decay, free_pa
 from training.trials.mesh_rooms import house, l_plan, material, places_in, pyramid, shoebox_plan, two_rooms
 
 FEW = Sizes(rays=4_000, runs=2, receivers=8, pairs=2, free_paths=50_000, edges=40)
-OFTEN = {0, 1, 3, 5, 8, 11}
+OFTEN = {0, 1, 3, 5, 6, 9}
 """Numbers of the laws that stand for their like in the ordinary run."""
 
 
@@ -42,7 +42,7 @@ def test_rooms_have_their_volumes_and_face_inwards():
 def test_what_is_measured_is_what_the_law_says(law):
     found = law(FEW, rng())
     assert abs(found.off_db) < 0.3 + 4 * found.error_db
-    assert found.error_db < 0.7
+    assert found.error_db < 1.0
 
 
 def test_a_tracer_that_loses_energy_is_told(monkeypatch):
@@ -52,7 +52,7 @@ def test_a_tracer_that_loses_energy_is_told(monkeypatch):
         return 0.8 * whole(self, emitter, rays=rays, rng=rng)
 
     monkeypatch.setattr(MeshRayTracer, "trace", leaking)
-    for law in (mesh_laws.mirrored_by_a_slope, LAWS[4], LAWS[7]):
+    for law in (mesh_laws.mirrored_by_a_slope, LAWS[4], LAWS[6]):
         found = law(FEW, rng())
         assert found.off_db == pytest.approx(power_to_db(0.8), abs=0.3)
 
