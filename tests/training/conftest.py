@@ -1,8 +1,10 @@
 """The smallest scene, simulated, trained and exported once for all tests."""
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +23,15 @@ from training.bundling import export as export_module
 from training.bundling import noise
 from training.bundling.export import export
 from training.data.dataset import Dataset
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFile
 from training.learning.runs import Configuration, claim
 from training.learning.train import train
 from training.models.encoders import FieldShape
 from training.parallel.jobs import LocalJobs
 from training.simulation import planner
-from training.simulation.predictions import Predictions
+from training.simulation.level_predictions import LevelPredictions
+from training.simulation.plan_predictions import PlanPredictions
 from training.simulation.responses import SimulatedResponses
 from training.simulation.run import simulate
 
@@ -104,18 +108,21 @@ def _traced_once(tmp_path_factory) -> Iterator[None]:
 def _tried_once() -> Iterator[None]:
     """Predictions, whose trial takes a second, are kept for all plans of a scene and its probes: they follow from these
     alone. Trials of large scenes are large, so few are kept."""
-    kept: dict[tuple[str, bytes], Predictions] = {}
+    kept: dict[tuple[str, bytes], PlanPredictions | LevelPredictions] = {}
 
-    def predictions(scene: SceneFile, probes: npt.NDArray[np.float64]) -> Predictions:
-        key = scene.model_dump_json(exclude={"effects"}), probes.tobytes()
-        found = kept.pop(key, None) or Predictions(scene, probes)
+    def predictions(scene: Any, probes: npt.NDArray[np.float64]) -> PlanPredictions | LevelPredictions:
+        said = {name: value for name, value in scene.identity.items() if name != "effects"}
+        key = json.dumps(said), probes.tobytes()
+        kind = LevelPredictions if isinstance(scene, LevelScene) else PlanPredictions
+        found = kept.pop(key, None) or kind(scene, probes)
         if len(kept) == 4:
             del kept[next(iter(kept))]
         kept[key] = found  # the latest at the end
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(planner, "Predictions", predictions)
+        patch.setattr(planner, "PlanPredictions", predictions)
+        patch.setattr(planner, "LevelPredictions", predictions)
         yield
 
 

@@ -15,7 +15,7 @@ from server.scene.manifest import (
     Manifest,
     QualityLevel,
 )
-from training.bundling.manifests import mesh_files
+from training.bundling.manifests import mesh_files, rendered_effects
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFileError
@@ -65,6 +65,7 @@ def bundle_of_level(scene: LevelScene, folder: Path) -> Bundle:
         image_order=GEOMETRIC_ORDER,
         transmission=any(material.surface_mass_kg_m2 for material in place.materials.values()),
         start=scene.file.start,
+        effects=rendered_effects(scene),
         codec=CodecParameters(
             sample_rate=_SAMPLE_RATE,
             n_fft=_N_FFT,

@@ -26,6 +26,7 @@ from server.scene.manifest import (
 from training.data.dataset import GEOMETRIC_ORDER, SPEED_OF_SOUND
 from training.data.levels.level_scene import MESH_FILE, LevelScene
 from training.data.responses import ImportedDataset, ResponsesError
+from training.data.scene_file import SceneFile
 from training.simulation.responses import SimulatedResponses
 
 _MARGIN_M = 0.1
@@ -65,13 +66,18 @@ def simulated_manifest(responses: SimulatedResponses, fields: Fields, *, whole: 
         direct_sound="field" if whole else "geometry",
         transmission=responses.dataset.effects.transmission,
         start=scene.start,
-        effects={name: scene.effects[name] for name in EffectName if name in scene.effects},
+        effects=rendered_effects(scene),
         format_version=DIRECTIONS_FORMAT if has_directions else EARS_FORMAT,
         codec=fields.codec,
         fields=fields.fields,
         levels=fields.levels,
         files=fields.files,
     )
+
+
+def rendered_effects(scene: SceneFile | LevelScene) -> dict[EffectName, bool]:
+    """The effects of a scene file that rendering has, on or off."""
+    return {name: scene.effects[name] for name in EffectName if name in scene.effects}
 
 
 def mesh_files(level: LevelScene, *, moving: bool) -> tuple[SceneMesh, dict[str, bytes]]:
@@ -102,6 +108,7 @@ def _level_manifest(level: LevelScene, responses: SimulatedResponses, fields: Fi
         direct_sound="field" if whole else "geometry",
         transmission=responses.dataset.effects.transmission,
         start=level.file.start,
+        effects=rendered_effects(level),
         format_version=MESH_FORMAT,
         codec=fields.codec,
         fields=fields.fields,

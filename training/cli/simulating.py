@@ -47,19 +47,15 @@ def wide_console(*, stderr: bool = False) -> Console:
 def simulation_of(scene: Path, seed: int, effects: str, folder: Path) -> "PairSimulation":
     """A prepared simulation, new or as it was begun in `folder`, with a plan that predicts its cost on this host."""
     from training.data.dataset import Dataset
-    from training.data.levels.level_scene import LevelScene, is_same_scene
-    from training.simulation.cost import is_brief, predicted_s, with_costs
+    from training.data.levels.level_scene import is_same_scene
+    from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
-    from training.simulation.size import level_extent
 
     read, decided = _plan_by_size(scene, seed, effects)
     begun = Dataset.open(folder, finished=False) if (folder / "pairs.h5").exists() else None
     if begun is not None and (begun.seed != seed or not is_same_scene(begun.place, read)):
         begun = None  # `simulate` refuses the folder
     simulation = prepared(read, seed=seed, plan=decided, begun=begun)
-    if isinstance(read, LevelScene):
-        level_extent(read, len(simulation.probes))  # before anything is traced
-        return replace(simulation, plan=replace(decided, cost_s=predicted_s(simulation)))
     return replace(simulation, plan=with_costs(simulation)) if is_brief(read) else simulation
 
 
@@ -68,18 +64,15 @@ def _plan_by_size(scene: Path, seed: int, effects: str) -> "tuple[SceneFile | Le
     known."""
     from training.data.levels.level_scene import LevelScene, read_scene
     from training.data.simulation_plan import overrides_among
-    from training.simulation.planner import plan_of_level, planner_of
+    from training.simulation.planner import planner_of
     from training.simulation.size import SimulationSize
 
     named = _parse_effects(effects)
     read = read_scene(scene)
-    if isinstance(read, LevelScene):
-        if named:
-            raise NafirError("--effects: a level is simulated with everything on: leave the option out")
-        return read, plan_of_level(read)
     planner = planner_of(read, seed)
     decided = planner.everything if effects == "all" else planner.plan(overrides_among({**read.effects, **named}))
-    return read, replace(decided, cost_s=60 * SimulationSize(read).core_minutes)
+    cost_s = None if isinstance(read, LevelScene) else 60 * SimulationSize(read).core_minutes
+    return read, replace(decided, cost_s=cost_s)
 
 
 def _parse_effects(effects: str) -> dict[str, bool]:
@@ -111,15 +104,12 @@ def plan(
 ) -> None:
     """Show what simulating a scene calls for, why, and how long it will take."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from training.data.levels.level_scene import LevelScene
     from training.simulation.cost import is_brief, with_costs
     from training.simulation.run import prepared
 
-    read, planned = _plan_by_size(scene, seed, effects)
-    if isinstance(read, LevelScene):
-        if check is not None:
-            raise NafirError("--check: a level is simulated with everything on: there is nothing to compare with")
-    elif is_brief(read):
+    with wide_console(stderr=True).status("planning"):
+        read, planned = _plan_by_size(scene, seed, effects)
+    if is_brief(read):
         planned = with_costs(prepared(read, seed=seed, plan=planned, most_tail_rays=_TAIL_RAYS_TRIED))
     checked = None if check is None else _check(scene, planned, check, seed)
     if as_json:
@@ -135,11 +125,11 @@ def plan(
 def _check(scene: Path, planned: "SimulationPlan", emitters: int, seed: int) -> "PlanCheck":
     from rich.progress import track
 
-    from training.data.scene_file import SceneFile
+    from training.data.levels.level_scene import read_scene
     from training.simulation.check import check_plan
     from training.simulation.planner import planner_of
 
-    read, console = SceneFile.read(scene), Console(stderr=True)
+    read, console = read_scene(scene), Console(stderr=True)
     return check_plan(
         read,
         planned,
@@ -170,14 +160,12 @@ def print_plan(console: Console, scene: "SceneFile | LevelScene", plan: "Simulat
     from training.data.levels.level_scene import LevelScene
     from training.simulation.size import SimulationSize, level_extent
 
+    console.print(plan_table(plan))
     if isinstance(scene, LevelScene):
-        console.print(_summary(plan), highlight=False)
-        if plan.cost_s is not None:
-            console.print(f"about {plan.cost_s:,.0f} s of one core, by short runs here", highlight=False)
-        console.print(level_extent(scene, len(scene.probe_positions(seed))), highlight=False)
+        extent = level_extent(scene, len(scene.probe_positions(seed)))
     else:
-        console.print(plan_table(plan))
-        console.print(f"{SimulationSize(scene).extent} at most", highlight=False)
+        extent = f"{SimulationSize(scene).extent} at most"
+    console.print(extent, highlight=False)
     for note in plan.notes:
         console.print(f"note: {note}", highlight=False)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from server.acoustics.geometry import Points
 from server.core.errors import NafirError
@@ -33,6 +33,17 @@ TALLEST_M = 200.0
 """The tallest halls have 160 m, and the longest some 500 m."""
 CLEARANCE_M = 0.05
 
+
+def _known_effects(effects: dict[str, bool]) -> dict[str, bool]:
+    known = list(dict.fromkeys([*EffectName, *SimulatedEffect]))
+    for name in effects:
+        if name not in known:
+            raise ValueError(f"there is no effect {name!r}, only {', '.join(known)}")
+    return effects
+
+
+NamedEffects = Annotated[dict[str, bool], AfterValidator(_known_effects)]
+"""Effects that are on or off, whatever the plans of rendering and simulation say."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -108,8 +119,7 @@ class SceneFile(Strict):
     start: Start
     probes: Probes
     simulation: Simulation
-    effects: dict[str, bool] = Field(default_factory=dict)
-    """Effects that are on or off, whatever the plans of rendering and simulation say."""
+    effects: NamedEffects = Field(default_factory=dict)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -132,15 +142,6 @@ class SceneFile(Strict):
             raise SceneFileError(f"{path}: {place}{first['msg'].removeprefix('Value error, ')}") from exc
         except (ValueError, RecursionError) as exc:  # numbers of thousands of digits, and nesting without end
             raise SceneFileError(f"{path}: not TOML: {exc}") from exc
-
-    @field_validator("effects")
-    @classmethod
-    def _are_effects(cls, effects: dict[str, bool]) -> dict[str, bool]:
-        known = list(dict.fromkeys([*EffectName, *SimulatedEffect]))
-        for name in effects:
-            if name not in known:
-                raise ValueError(f"there is no effect {name!r}, only {', '.join(known)}")
-        return effects
 
     @model_validator(mode="after")
     def _is_a_room(self) -> Self:

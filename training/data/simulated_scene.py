@@ -1,6 +1,7 @@
 """What a simulation asks of a scene, be it a floor plan (`training.data.scene_file`) or a level
 (`training.data.levels.level_scene`)."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,6 +25,10 @@ class SimulatedScene(Protocol):
 
     @property
     def simulation(self) -> Simulation: ...
+
+    @property
+    def effects(self) -> Mapping[str, bool]:
+        """Effects that are on or off, whatever the plans of rendering and simulation say."""
 
     @property
     def identity(self) -> dict[str, Any]:

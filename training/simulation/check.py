@@ -17,7 +17,7 @@ from server.acoustics.metrics import parameter_errors, summarise
 from server.acoustics.room_parameters import RoomParameters, measure
 from server.rendering.hrtf import kemar
 from training.data.dataset import GEOMETRIC_ORDER
-from training.data.scene_file import SceneFile
+from training.data.door_states import DoorStates, EmitterScenes
 from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan
 from training.simulation.direct_paths import DirectPaths
@@ -61,7 +61,7 @@ class PlanCheck:
 
 
 def check_plan(
-    scene: SceneFile,
+    scene: SimulatedScene,
     plan: SimulationPlan,
     everything: SimulationPlan,
     *,
@@ -70,18 +70,19 @@ def check_plan(
     track: Callable[[Iterable[int]], Iterable[int]],
 ) -> PlanCheck:
     """Simulate `emitters` emitters by the plan and with every effect on, and compare. Second takes, as of held-out
-    pairs, are also simulated and timed, but not compared."""
+    pairs, are also simulated and timed, but not compared. Doors are in the states of a dataset with this seed."""
     probes = scene.probe_positions(seed)
+    states = DoorStates.of(scene, len(probes), seed)
     yaws = 2 * np.pi * np.arange(scene.simulation.yaws) / scene.simulation.yaws
     settings = {"everything": (everything, seed), "again": (everything, seed + 1), "plan": (plan, seed)}
     simulations, once_s = {}, 0.0
     for name, (of, drawn) in settings.items():  # the plan comes last, because the first simulation also loads code
         began = process_time()
-        simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of)
+        simulations[name] = PairSimulation.prepare(scene, probes, yaws, seed=drawn, plan=of, states=states)
         once_s = process_time() - began
     seconds = dict.fromkeys(simulations, 0.0)
     measured: dict[str, list[RoomParameters]] = {name: [] for name in simulations}
-    geometry = GeometricResponses(scene, everything, probes, yaws)
+    geometry = GeometricResponses(scene, everything, probes, yaws, states)
     for emitter in track(np.unique(np.linspace(0, len(probes) - 1, emitters).astype(int)).tolist()):
         listeners = np.delete(np.arange(len(probes)), emitter)
         known = geometry.responses(emitter, listeners)
@@ -114,18 +115,28 @@ class GeometricResponses:
     """Computes the direct sound and the first reflections, which datasets do not store, at the orientations that are
     compared."""
 
-    def __init__(self, scene: SimulatedScene, plan: SimulationPlan, probes: _Floats, yaws: _Floats) -> None:
+    def __init__(
+        self,
+        scene: SimulatedScene,
+        plan: SimulationPlan,
+        probes: _Floats,
+        yaws: _Floats,
+        states: DoorStates | None = None,
+    ) -> None:
+        """`states` of doors as in `PairSimulation`."""
         settings = scene.simulation
         samples = round(settings.duration_s * settings.sample_rate)
         directions = sphere_directions(settings.arrival_directions)
         self._synthesis = BinauralSynthesis(kemar(settings.sample_rate), directions, _compared(yaws), samples)
         self._probes = probes
-        self._direct = DirectPaths.of(scene, plan)
-        self._tracer = RoomTracer.of(scene, plan, probes, image_order=GEOMETRIC_ORDER)
+        self._scenes, self._plan = EmitterScenes(scene, states or DoorStates.none(len(probes))), plan
 
     def responses(self, emitter: int, listeners: npt.NDArray[np.integer]) -> _Responses:
         """(listener, yaw, ear, sample) direct sound and first reflections of one emitter."""
-        place, reflections = self._probes[emitter], self._tracer.images(self._probes[emitter])
+        scene, place = self._scenes.of(emitter), self._probes[emitter]
+        direct = DirectPaths.of(scene, self._plan)
+        tracer = RoomTracer.of(scene, self._plan, self._probes, image_order=GEOMETRIC_ORDER, few_rays=True)
+        reflections = tracer.images(place)
 
         def response(images: tuple[_Floats, _Floats], receiver: _Floats) -> npt.NDArray[np.float32]:
             positions, amplitudes = images
@@ -133,7 +144,7 @@ class GeometricResponses:
 
         return np.stack(
             [
-                response(self._direct.images(place, self._probes[listener]), self._probes[listener])
+                response(direct.images(place, self._probes[listener]), self._probes[listener])
                 + response(reflections[listener], self._probes[listener])
                 for listener in listeners
             ]

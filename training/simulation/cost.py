@@ -7,6 +7,7 @@ from time import thread_time
 
 import numpy as np
 
+from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFile
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan
 from training.simulation.pairs import PairSimulation
@@ -34,8 +35,11 @@ def predicted_s(simulation: PairSimulation) -> float:
     return simulation.prepared_s + probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
 
 
-def is_brief(scene: SceneFile) -> bool:
-    """Whether the short runs that predict the cost of this scene take little time."""
+def is_brief(scene: SceneFile | LevelScene) -> bool:
+    """Whether the short runs that predict the cost of this scene take little time. Those of a level do, since rays in a
+    mesh take little longer where it has more triangles."""
+    if isinstance(scene, LevelScene):
+        return True
     size = SimulationSize(scene)
     rays = min(1.0, _RAYS_TRIED / scene.simulation.rays)
     return size.tracing_s * rays < _LONGEST_TRIAL_S

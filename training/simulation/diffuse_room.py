@@ -71,10 +71,7 @@ class DiffuseRoom:
     def reverberation_time_s(self) -> _Floats:
         """(band,) T60 by Eyring (J. Acoust. Soc. Am. 1, 1930), with absorption by the air (Kuttruff, Room Acoustics,
         5.1)."""
-        by_walls = -self.surface_m2 * np.log1p(-self.absorption)
-        per_m = np.zeros(len(self.absorption)) if self.air is None else self.air.absorption_db_per_m * _NEPERS_PER_DB
-        area = by_walls + 4 * per_m * self.volume_m3
-        return np.asarray(4 * _SIXTY_DB * self.volume_m3 / (self.speed_of_sound * area))
+        return eyring_time_s(self.mean_free_path_m, self.absorption, self.air, self.speed_of_sound)
 
     def reflected_power(self, order: int) -> _Floats:
         """(band,) power of all sound that was reflected at least `order` times. It is a geometric series; its sum from
@@ -103,3 +100,11 @@ class DiffuseRoom:
         rate = float(np.average(decay_per_s, weights=power * _BANDWIDTHS_HZ))
         late_s, early_lasts_s = 2 / rate, 2 / rate * np.tanh(rate * early_s / 2)
         return float(10 / np.log(10) * np.sqrt(1 / (bandwidth_hz * late_s) + 1 / (bandwidth_hz * early_lasts_s)))
+
+
+def eyring_time_s(mean_free_path_m: float, absorption: _Floats, air: Air | None, speed_of_sound: float) -> _Floats:
+    """(band,) T60 by Eyring, for a mean free path of four times the volume divided by the surface, and a mean
+    absorption (band,) by the surfaces."""
+    absorbed = np.clip(absorption, _LEAST_SHARE, 1 - _LEAST_SHARE)
+    per_m = np.zeros(len(absorbed)) if air is None else air.absorption_db_per_m * _NEPERS_PER_DB
+    return np.asarray(_SIXTY_DB / (speed_of_sound * (per_m - np.log1p(-absorbed) / mean_free_path_m)))

@@ -109,13 +109,18 @@ class MeshRayTracer:
         arrival_directions: _Floats,
         tree: MeshTree | None = None,
         losses_db: npt.ArrayLike | None = None,
+        few_rays: bool = False,
+        only_through: bool = False,
     ) -> None:
         """Prepare tracing for `duration_s`. Direct sound and specular paths of up to `image_order` reflections are left
         out, because image sources give them; those that were reflected and went through a wall are not. `tree` is the
         mesh's, if there is one already.
 
         `losses_db` (material, band) is what walls take from sound that goes through them, infinite where none does.
-        Without it, no energy goes through walls."""
+        Without it, no energy goes through walls.
+
+        With `few_rays`, no triangles are looked for beforehand that are in sight as a whole. Energies are the same.
+        With `only_through`, only what went through walls is collected. The rest is the energy without `losses_db`."""
         mesh, tree = geometry.mesh, tree or MeshTree(geometry.mesh)
         order = tree.tree.numbers
         absorbed = geometry.of_surfaces("absorption")
@@ -129,10 +134,11 @@ class MeshRayTracer:
             geometry.of_surfaces("scattering"),
         )
         self._through = through if through.any() else None
+        self._least_walls = 1 if only_through else 0
         positions = np.ascontiguousarray(receivers, dtype=np.float64)
         radii = np.minimum(tree.distance_m(positions), LARGEST_RADIUS_M)
-        is_few = len(positions) * len(order) ** 2 <= _MOST_LOOKS
-        is_open = np.zeros((len(positions), len(order) if is_few else 0), np.bool_)
+        looks = not few_rays and len(positions) * len(order) ** 2 <= _MOST_LOOKS
+        is_open = np.zeros((len(positions), len(order) if looks else 0), np.bool_)
         _look(tree.tree, self._place.normals, positions, is_open)
         self._receivers = _Receivers(positions, radii, nearest_directions(arrival_directions), is_open)
         self._image_order = image_order
@@ -155,6 +161,7 @@ class MeshRayTracer:
             np.asarray(emitter, dtype=np.float64),
             sphere_directions(rays) @ turn,
             self._image_order,
+            self._least_walls,
             rng,
             Histogram(energy, HISTOGRAM_BIN_S * SPEED_OF_SOUND),
         )
@@ -169,11 +176,12 @@ def _trace(
     emitter: _Floats,
     directions: _Floats,
     image_order: int,
+    least_walls: int,
     rng: np.random.Generator,
     histogram: Histogram,
 ) -> None:
-    """Add the energy of all rays to the histogram. `let` (material, band) is the share that may go through walls of a
-    material; None compiles code that does without."""
+    """Add the energy of all rays to the histogram, but for what went through fewer walls than `least_walls`. `let`
+    (material, band) is the share that may go through walls of a material; None compiles code that does without."""
     tree, rays = place.tree, len(directions)
     end_m = histogram.energy.shape[1] * histogram.bin_m
     stack = np.empty(STACK, np.int32)
@@ -212,7 +220,7 @@ def _trace(
                 # Scattered energy reaches receivers as diffuse rain, but not through walls. Image sources account for
                 # the first reflections, and direct paths for what was never reflected.
                 is_late = was_scattered or walls > 0 or reflections > image_order
-                if reflections > 0 and (is_through or (is_mirrored and is_late)):
+                if reflections > 0 and walls >= least_walls and (is_through or (is_mirrored and is_late)):
                     add_crossings(receivers, (px, py, pz), (dx, dy, dz), length, travelled_m, weight, histogram)
                 if row < 0:
                     break  # it left, under the open sky or through a hole
@@ -245,9 +253,11 @@ def _trace(
                 for band in range(BANDS):
                     weight[band] *= place.reflected[surface, band]
                 first = int(rng.random() * EVERY)
-                _add_rain(
-                    place, receivers, stack, blockers, first, row, (px, py, pz), normal, travelled_m, weight, histogram
-                )
+                if walls >= least_walls:
+                    at_wall = px, py, pz
+                    _add_rain(
+                        place, receivers, stack, blockers, first, row, at_wall, normal, travelled_m, weight, histogram
+                    )
                 is_scattered = rng.random() < place.scattered[surface, ray % BANDS]
                 loudest = weigh(place, surface, is_scattered, kept, chance, weight)
                 if loudest <= 0.0:

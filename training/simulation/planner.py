@@ -4,32 +4,28 @@ An effect is called for if leaving it out would change some parameter by a quart
 more: errors of the data add to the errors of the fields trained on them, which are two to three times as large.
 """
 
-from dataclasses import replace
-
 from server.planning.decision import Threshold
 from training.data.dataset import GEOMETRIC_ORDER
 from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import Overrides, SimulatedEffect, SimulationDecision, SimulationPlan
+from training.simulation.level_predictions import LevelPredictions
+from training.simulation.plan_predictions import PlanPredictions
 from training.simulation.predictions import Prediction, Predictions
-from training.simulation.size import SimulationSize
+from training.simulation.size import SimulationSize, level_extent
 
 THRESHOLD = Threshold(enter_jnd=0.25, leave_jnd=0.25)
 
 
-def planner_of(scene: SceneFile, seed: int) -> "SimulationPlanner":
+def planner_of(scene: SceneFile | LevelScene, seed: int) -> "SimulationPlanner":
     """Return the planner for the probes of a dataset with this seed. Raises SceneFileError if the scene is too large to
     be simulated, or too large for its responses."""
+    if isinstance(scene, LevelScene):
+        probes = scene.probe_positions(seed)
+        level_extent(scene, len(probes))  # before anything is traced
+        return SimulationPlanner(LevelPredictions(scene, probes))
     SimulationSize(scene).require_reasonable()
-    return SimulationPlanner(Predictions(scene, scene.probe_positions(seed)))
-
-
-def plan_of_level(scene: LevelScene) -> SimulationPlan:
-    """Return the plan for a level, which leaves nothing out: what its effects change is not predicted."""
-    masses = [material.surface_mass_kg_m2 for material in scene.place.materials.values()]
-    plan = SimulationPlan.everything(GEOMETRIC_ORDER, scene.simulation.rays, transmission=any(masses))
-    note = "levels are simulated with everything on; what more than one surface mirrors is traced by rays"
-    return replace(plan, notes=(note,))
+    return SimulationPlanner(PlanPredictions(scene, scene.probe_positions(seed)))
 
 
 class SimulationPlanner:
@@ -39,17 +35,13 @@ class SimulationPlanner:
         self._predictions = predictions
         self._settings = predictions.scene.simulation
         self._refuse_what_is_too_far()
-        self._by_order = {
-            order: predictions.early_reflections(order)
-            for order in range(GEOMETRIC_ORDER + 1, self._settings.image_order + 1)
-        }
+        self._by_order = {order: predictions.early_reflections(order) for order in predictions.orders}
 
     @property
     def everything(self) -> SimulationPlan:
         """The plan with every effect on that the scene file allows."""
-        has_mass = self._predictions.scene.geometry.materials.walls.surface_mass_kg_m2 is not None
-        never = {SimulatedEffect.DIRECTIVITY: False, SimulatedEffect.TRANSMISSION: has_mass}
-        return self.plan({**dict.fromkeys(SimulatedEffect, True), **never})
+        fixed = {name: each.is_on for name, each in self._predictions.fixed.items()}
+        return self.plan({**dict.fromkeys(SimulatedEffect, True), **fixed})
 
     def plan(self, overrides: Overrides) -> SimulationPlan:
         """Make a plan. Raises SceneFileError for an override that the scene cannot follow."""
@@ -72,15 +64,19 @@ class SimulationPlanner:
                 0.0, "level", "fields are of emitters that radiate all round; rendering gives each its directivity"
             ),
         }
-        is_on = {name: THRESHOLD.decides(each.change_jnd, overrides.get(name)) for name, each in decided.items()}
+        fixed = {name: each.is_on for name, each in predicted.fixed.items()}
+        if not has_rays:
+            fixed.pop(SimulatedEffect.PER_SOURCE_TAIL, None)
+        wanted = {**overrides, **fixed}
+        is_on = {name: THRESHOLD.decides(each.change_jnd, wanted.get(name)) for name, each in decided.items()}
         has_own_tails = is_on[SimulatedEffect.PER_SOURCE_TAIL]
-        shares_tail = has_rays and not has_own_tails and not predicted.ends_before_tail
-        rays = predicted.rays() if shares_tail else self._settings.rays
+        tail = predicted.shared_tail() if has_rays and not has_own_tails else None
+        rays = self._settings.rays if tail is None else tail.rays
         return SimulationPlan(
             image_order=order,
             rays=rays if has_rays else 0,
-            tail_start_s=predicted.tail_start_s if shares_tail else None,
-            tail_rays=predicted.tail_rays() if shares_tail else 0,
+            tail_start_s=None if tail is None else tail.start_s,
+            tail_rays=0 if tail is None else tail.tail_rays,
             scattering=is_on[SimulatedEffect.SCATTERING],
             air_absorption=is_on[SimulatedEffect.AIR_ABSORPTION],
             diffraction=is_on[SimulatedEffect.DIFFRACTION],
@@ -100,7 +96,7 @@ class SimulationPlanner:
         if SimulatedEffect.EARLY_REFLECTIONS in overrides:
             order = self._settings.image_order if overrides[SimulatedEffect.EARLY_REFLECTIONS] else GEOMETRIC_ORDER
         if not self._by_order:
-            return order, Prediction(0.0, "spectrum", "the scene file asks for none beyond those left to geometry")
+            return order, Prediction(0.0, "spectrum", self._predictions.no_orders)
         largest = max(self._by_order.values(), key=lambda each: each.change_jnd)
         reason = "; ".join(f"{each.reason} ({each.change_jnd:.2f} JND)" for each in self._by_order.values())
         return order, Prediction(largest.change_jnd, largest.parameter, reason)
@@ -116,11 +112,6 @@ class SimulationPlanner:
             )
 
     def _refuse_what_cannot_be(self, overrides: Overrides) -> None:
-        scene = self._predictions.scene
-        if overrides.get(SimulatedEffect.DIRECTIVITY):
-            raise SceneFileError(
-                f"{scene.id}: effects.directivity: cannot be on: probes radiate all round, and directivity is applied "
-                "where emitters are rendered"
-            )
-        if overrides.get(SimulatedEffect.TRANSMISSION) and scene.geometry.materials.walls.surface_mass_kg_m2 is None:
-            raise SceneFileError(f"{scene.id}: effects.transmission: needs geometry.materials.walls.surface_mass_kg_m2")
+        for name, fixed in self._predictions.fixed.items():
+            if overrides.get(name, fixed.is_on) != fixed.is_on:
+                raise SceneFileError(f"{self._predictions.scene.id}: effects.{name}: {fixed.otherwise}")

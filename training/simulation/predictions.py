@@ -1,10 +1,13 @@
 """Predictions of what leaving an effect out of a simulation would change, made before it from geometry, statistical
 acoustics and a trial with few rays: in just-noticeable differences, with a reason in words.
 
-Axes: (pair, band); lengths are in metres. Power is squared pressure relative to the direct sound at one metre.
+The laws here are those of floor plans (`training.simulation.plan_predictions`) and of levels
+(`training.simulation.level_predictions`). Axes: (pair, band); lengths are in metres. Power is squared pressure relative
+to the direct sound at one metre.
 """
 
-import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,36 +17,16 @@ import numpy.typing as npt
 from server.acoustics.audibility import JND_THRESHOLDS
 from server.acoustics.bands import OCTAVE_BANDS_HZ, bands_within
 from server.acoustics.decibels import db_to_power, power_to_db
-from server.acoustics.geometry import FloorPlan
-from server.acoustics.sound_path import PlanPathFinder, SoundPaths
-from server.acoustics.transmission import transmission_loss_db, walls_between
+from server.acoustics.sound_path import SoundPaths
 from server.planning.change import Change
 from server.scene.limits import MOST_SAMPLES
-from training.data.dataset import SPEED_OF_SOUND
-from training.data.scene_file import SceneFile
-from training.data.shared_tail import FADE_S
-from training.data.simulation_plan import SimulationPlan
-from training.simulation.diffuse_room import DiffuseRoom
-from training.simulation.rays import receiver_radii, surface_shares
-from training.simulation.size import SimulationSize
-from training.simulation.tracing import RoomTracer
-from training.simulation.trial import Trial
+from training.data.simulated_scene import SimulatedScene
+from training.data.simulation_plan import SimulatedEffect
+from training.simulation.trial import UNHEARD_POWER, Trial
 
 _Floats = npt.NDArray[np.float64]
 
-_EARLY_S = 0.050
-# A limited number of rays may increase the standard deviation of clarity between draws of the noise by a tenth.
-_RAY_VARIANCE = 1.1**2 - 1
-# For chords of a sphere along parallel lines: the mean of the square over the square of the mean.
-_CHORDS = 9 / 8
-_LEVEL_DB = JND_THRESHOLDS["level"].amount
-_EMITTERS_TRIED = 16
-# Allowed standard error of a shared tail's reverberation time, relative: one just-noticeable difference.
-_TAIL_ERROR = JND_THRESHOLDS["t60"].amount / 100
-# Limit of the rays of a shared tail, as a multiple of the rays of one emitter.
-_MOST_TAIL_RAYS = 16
-# Limits of tests: of sequences of walls for each receiver, and of paths round corners for each wall.
-_MOST_IMAGE_TESTS, _MOST_PATH_TESTS = 30_000_000, 20_000_000
+LEVEL_DB = JND_THRESHOLDS["level"].amount
 
 
 @dataclass(frozen=True)
@@ -54,78 +37,137 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Predictions:
-    """Predictions for one scene and its probes (probe, xyz)."""
+class Fixed:
+    """An effect that is on, or off, whatever is asked for. `otherwise` is what an error says where the other is."""
 
-    scene: SceneFile
-    probes: _Floats
+    is_on: bool
+    otherwise: str
 
-    @cached_property
-    def room(self) -> DiffuseRoom:
-        return DiffuseRoom(self.scene.geometry, self.scene.air, SPEED_OF_SOUND)
 
-    @cached_property
-    def floor_plan(self) -> FloorPlan:
-        return self.scene.geometry.floor_plan
+@dataclass(frozen=True)
+class TailNeeds:
+    """What a tail that all pairs share takes: the time after emission at which it begins, its rays, and the `rays` of
+    each emitter for what comes before it."""
 
-    @cached_property
-    def longest_onset_s(self) -> float:
-        """The longest propagation time of direct sound between two probes."""
-        return float(self._paths.length_m.max() / SPEED_OF_SOUND)
+    start_s: float
+    tail_rays: int
+    rays: int
 
-    @cached_property
-    def longest_way_s(self) -> float:
-        """The longest propagation time of direct sound between two probes or between the scene's start positions."""
-        start = self.scene.start
-        start_m = self.floor_plan.path_length_m(np.array(start.emitter), np.array(start.listener))
-        return max(self.longest_onset_s, float(start_m) / SPEED_OF_SOUND)
+
+@dataclass(frozen=True)
+class HeardPairs:
+    """Pairs of probes, with the doors of a level in one state. `paths` (pair,) are those of the direct sound, and
+    `reverberant_power` (pair, band) is that of all reflections but what goes through walls."""
+
+    paths: SoundPaths
+    reverberant_power: _Floats
 
     @property
-    def is_one_room(self) -> bool:
-        """Whether every place is in sight of every other."""
-        return len(self.floor_plan.bend_corners) == 0
+    def hidden(self) -> npt.NDArray[np.bool_]:
+        return ~self.paths.in_sight
 
-    @cached_property
-    def trial(self) -> Trial:
-        return Trial(self.scene, self.probes)
+    @property
+    def direct_power(self) -> _Floats:
+        """(pair, 1) power of the direct sound along its path, round corners if necessary, without the loss at
+        corners."""
+        return np.asarray(self.paths.length_m[:, None] ** -2)
+
+    @property
+    def straight_power(self) -> _Floats:
+        """(pair, 1) power of the direct sound along a straight line, through all obstacles."""
+        return np.asarray((self.paths.length_m - self.paths.excess_m)[:, None] ** -2)
+
+    def without_diffraction_jnd(self) -> float:
+        """The largest change of level without what bends."""
+        bent = db_to_power(self.paths.screen_db) * self.direct_power
+        straight = np.where(self.paths.in_sight[:, None], self.direct_power, 0.0)
+        beside = self.reverberant_power + UNHEARD_POWER
+        changes_db = np.abs(power_to_db((bent + beside) / (straight + beside)))
+        return float(np.max(changes_db, initial=0.0)) / LEVEL_DB
+
+    def without_transmission_jnd(self, losses_db: _Floats) -> float:
+        """The largest change of level without the direct sound that goes through walls, which take `losses_db` (hidden
+        pair, band): infinite where they let nothing through."""
+        hidden = self.hidden
+        through = self.straight_power[hidden] * db_to_power(-losses_db)
+        bent = db_to_power(self.paths.screen_db[hidden]) * self.direct_power[hidden]
+        changes_db = power_to_db(1 + through / (bent + self.reverberant_power[hidden] + UNHEARD_POWER))
+        return float(np.max(changes_db, initial=0.0)) / LEVEL_DB
+
+
+class Predictions(ABC):
+    """Predictions for one scene and its `probes` (probe, xyz)."""
+
+    scene: SimulatedScene
+    probes: _Floats
+
+    @property
+    @abstractmethod
+    def orders(self) -> range:
+        """The orders of mirrored reflections that images may give, beyond those computed from geometry."""
+
+    @property
+    def no_orders(self) -> str:
+        """Why there are none."""
+        return "the scene file asks for none beyond those left to geometry"
+
+    @property
+    @abstractmethod
+    def trials(self) -> Mapping[str, Trial]:
+        """A trial for each state of the doors, by that state in words."""
+
+    @property
+    @abstractmethod
+    def longest_way_s(self) -> float:
+        """The longest propagation time of direct sound between two probes or between the scene's start positions."""
+
+    @property
+    @abstractmethod
+    def largest_scattering(self) -> float:
+        """The largest share that any surface scatters in any band."""
+
+    @abstractmethod
+    def early_reflections(self, order: int) -> Prediction:
+        """Predict the change without mirrored paths of one of the `orders`."""
+
+    @abstractmethod
+    def per_source_tail(self, *, has_rays: bool) -> Prediction:
+        """Predict the change if all pairs share their late sound."""
+
+    @abstractmethod
+    def shared_tail(self) -> TailNeeds | None:
+        """What the tail takes if it is shared; None if it cannot be."""
+
+    @abstractmethod
+    def diffraction(self) -> Prediction: ...
+
+    @abstractmethod
+    def transmission(self) -> Prediction: ...
+
+    @property
+    @abstractmethod
+    def no_mass(self) -> str:
+        """What an error says where transmission is asked for, and no wall has a mass; empty if one has."""
+
+    @property
+    def fixed(self) -> Mapping[SimulatedEffect, Fixed]:
+        """The effects that nobody can ask for, or do without."""
+        told = "cannot be on: probes radiate all round, and directivity is applied where emitters are rendered"
+        fixed = {SimulatedEffect.DIRECTIVITY: Fixed(False, told)}
+        return fixed | ({SimulatedEffect.TRANSMISSION: Fixed(False, self.no_mass)} if self.no_mass else {})
 
     def late_reverberation(self) -> Prediction:
         reason = "what rays bring in a trial: all but direct sound and mirrored first reflections"
-        return _told(self.trial.without_late(), reason)
-
-    def early_reflections(self, order: int) -> Prediction:
-        """Predict the change without mirrored paths of this order, for the pair of probes with the largest change:
-        noise of the same energy would replace them, and its octave levels vary."""
-        settings = self.scene.simulation
-        everything = SimulationPlan.everything(settings.image_order, settings.rays)
-        shares = []
-        tests = SimulationSize(self.scene).sequences_of(order) * len(self.probes)
-        tried = int(np.clip(_MOST_IMAGE_TESTS / tests, 1, _EMITTERS_TRIED))
-        step = max(1, int(tests / _MOST_IMAGE_TESTS))
-        for at in np.unique(np.linspace(0, len(self.probes) - 1, tried).astype(int)):
-            emitter = self.probes[at]
-            receivers = np.delete(self.probes, at, axis=0)[::step]
-            tracer = RoomTracer.of(self.scene, everything, receivers, image_order=order, least_order=order)
-            distance = np.linalg.norm(receivers - emitter, axis=-1)
-            beside = distance[:, None] ** -2 + self.room.reflected_power(1)
-            power = np.array([(amplitudes**2).sum(axis=0) for _, amplitudes in tracer.images(emitter)])
-            shares.append(power / beside)
-        # These paths arrive within about one mean free path; noise of that length varies by 1 / sqrt(B T) in a band.
-        lasting_s = self.room.mean_free_path_m / SPEED_OF_SOUND
-        spread = 1 / np.sqrt(np.maximum(1.0, np.asarray(OCTAVE_BANDS_HZ) / np.sqrt(2) * lasting_s))
-        changes_db = power_to_db(1 + np.concatenate(shares) * spread)
-        over_bands = np.sqrt((changes_db**2).mean(axis=-1))
-        reason = f"paths by {order} surfaces bring {100 * np.mean(shares):.0f} % of the energy on average"
-        return Prediction(float(over_bands.max()) / JND_THRESHOLDS["spectrum"].amount, "spectrum", reason)
+        return self.largest(Trial.without_late, reason)
 
     def scattering(self, *, has_rays: bool) -> Prediction:
         if not has_rays:
             return Prediction(0.0, "level", "no rays are traced that could scatter")
-        share = surface_shares(self.scene.geometry)[1].max()
+        share = self.largest_scattering
         if not share:
             return Prediction(0.0, "level", "surfaces mirror all that they reflect")
         reason = f"surfaces scatter up to {100 * share:.0f} %, reflection after reflection; by a trial without it"
-        return _told(self.trial.without_scattering(), reason)
+        return self.largest(Trial.without_scattering, reason)
 
     def air_absorption(self, *, has_rays: bool, scatters: bool) -> Prediction:
         """Predict the change without air absorption, for the other effects as planned; a trial compares all
@@ -133,41 +175,22 @@ class Predictions:
         reason = "without the air's share reverberation lasts longer, by a trial"
         if not has_rays:
             reason = "on the way of direct sound and first reflections; nothing reverberates"
-        return _told(self.trial.without_air(has_rays=has_rays, scatters=scatters), reason)
+        return self.largest(lambda trial: trial.without_air(has_rays=has_rays, scatters=scatters), reason)
 
-    def per_source_tail(self, *, has_rays: bool) -> Prediction:
-        if not has_rays:
-            return Prediction(0.0, "level", "no rays are traced, so there is no late tail")
-        if self.ends_before_tail:
-            return Prediction(0.0, "level", "responses end before all places sound alike")
-        one_for_all = self.trial.with_one_tail(self.tail_start_s)
-        if not self.is_one_room:
-            coupling = self._passage_m2 / (self._passage_m2 + self.room.surface_m2 * self.room.absorption / 2)
-            change_db = -float(power_to_db(coupling).min())
-            reason = "walls part the plan, and behind them late sound is another"
-            by_coupling = Change(change_db / _LEVEL_DB, "level")
-            return _told(max(by_coupling, one_for_all, key=lambda each: each.jnd), reason)
-        reason = (
-            f"in one room without corners to hide behind, places differ for {1e3 * self.tail_start_s:.0f} ms "
-            "(Lindau et al. 2012), and from then on by this much, by a trial"
-        )
-        return _told(one_for_all, reason)
+    def largest(self, change: Callable[[Trial], Change], reason: str) -> Prediction:
+        """The largest change over the trials, and the reason with the state of the doors in which it is."""
+        changes = {state: change(trial) for state, trial in self.trials.items()}
+        state = max(changes, key=lambda each: changes[each].jnd)
+        told = f"{reason}, with {state}" if state and changes[state].jnd else reason
+        return Prediction(changes[state].jnd, changes[state].parameter, told)
 
-    @property
-    def tail_start_s(self) -> float:
-        """The time after emission at which the shared tail begins, for every receiver."""
-        return self.room.mixing_time_s + self.longest_onset_s
-
-    @property
-    def ends_before_tail(self) -> bool:
-        return self.tail_start_s + FADE_S >= self.scene.simulation.duration_s
-
-    @property
+    @cached_property
     def reverberation_s(self) -> tuple[float, float]:
         """The longest reverberation time (60 dB) over octave bands, and the centre frequency of that band in Hz; inf if
         the trial does not show the end of the decay."""
         audible = bands_within(self.scene.simulation.sample_rate)
-        times_s = np.nan_to_num(self.trial.reverberation_time_s[:audible], nan=np.inf)
+        of_trials = np.stack([trial.reverberation_time_s[:audible] for trial in self.trials.values()])
+        times_s = np.nan_to_num(of_trials, nan=np.inf).max(axis=0)
         longest = int(np.argmax(times_s))
         return float(times_s[longest]), OCTAVE_BANDS_HZ[longest]
 
@@ -199,135 +222,3 @@ class Predictions:
                 "what materials do there is not heard"
             )
         return tuple(notes)
-
-    def diffraction(self) -> Prediction:
-        paths = self._paths
-        bent = db_to_power(paths.screen_db) * self._direct_power
-        straight = np.where(paths.in_sight[:, None], self._direct_power, 0.0)
-        hidden = float(np.mean(~paths.in_sight))
-        changes = np.abs(power_to_db((bent + self._reverberant_power) / (straight + self._reverberant_power)))
-        reason = f"the direct sound of {100 * hidden:.0f} % of the pairs bends round corners"
-        if self.is_one_room:
-            reason = "no corner stands in any way"
-        return Prediction(float(changes.max()) / _LEVEL_DB, "level", reason)
-
-    def transmission(self) -> Prediction:
-        mass = self.scene.geometry.materials.walls.surface_mass_kg_m2
-        hidden = ~self._paths.in_sight
-        if mass is None or not hidden.any():
-            reason = "every pair is in sight" if mass is not None else "walls are solid: the scene gives them no mass"
-            return Prediction(0.0, "level", reason)
-        walls = walls_between(self.floor_plan, *self._pairs)[hidden, None]
-        loss_db = walls * transmission_loss_db(mass, OCTAVE_BANDS_HZ)
-        through = self._straight_power[hidden] * db_to_power(-loss_db)
-        bent = db_to_power(self._paths.screen_db[hidden]) * self._direct_power[hidden]
-        change_jnd = _level_change_jnd(through, bent + self._reverberant_power[hidden])
-        reason = f"walls of {mass:g} kg/m2, beside what comes round their corners and the reverberation behind them"
-        return Prediction(change_jnd, "level", reason)
-
-    def rays(self) -> int:
-        """Return the number of rays per emitter that keeps their part in the spread of clarity small, on average over
-        receivers; at most the number in the scene file.
-
-        If rays fill the room evenly, one crosses a sphere of radius r pi r**2 / V times per metre.
-        """
-        most = self.scene.simulation.rays
-        if not self.is_one_room:
-            return most
-        variance_db = _RAY_VARIANCE * self.room.clarity_spread_db(_EARLY_S) ** 2
-        crossings = _CHORDS * (10 / np.log(10)) ** 2 / variance_db
-        per_ray = SPEED_OF_SOUND * _EARLY_S * np.pi * receiver_radii(self.floor_plan, self.probes) ** 2
-        rays = float(np.mean(crossings * self.room.volume_m3 / per_ray))
-        return min(most, int(np.ceil(rays / 100)) * 100)
-
-    def tail_rays(self) -> int:
-        """Return the number of rays of a shared tail: that of one emitter, or more if the reverberation time needs
-        them.
-
-        The tail is part of every response. So its random error is the same for all pairs, and does not average out over
-        them.
-        """
-        rays = self.scene.simulation.rays
-        needed = self.trial.tail_rays(self.tail_start_s, _TAIL_ERROR)
-        return int(np.clip(math.ceil(np.nan_to_num(needed, nan=rays)), rays, _MOST_TAIL_RAYS * rays))
-
-    @cached_property
-    def _ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """(pair,) indices of the probes at both ends: each couple once or, where walls and probes are many, the couples
-        of some probes."""
-        count = len(self.probes)
-        tried = int(_MOST_PATH_TESTS / (count * len(self.floor_plan.corners)))
-        if tried >= count:
-            first, second = np.triu_indices(count, 1)
-            return first, second
-        some = np.unique(np.linspace(0, count - 1, max(2, tried)).astype(np.int64))
-        first, second = np.repeat(some, count), np.tile(np.arange(count), len(some))
-        return first[first != second], second[first != second]
-
-    @property
-    def _pairs(self) -> tuple[_Floats, _Floats]:
-        """(pair, xyz) positions of both ends."""
-        first, second = self._ends
-        return self.probes[first], self.probes[second]
-
-    @cached_property
-    def _paths(self) -> SoundPaths:
-        """(pair,) paths of the direct sound in the order of `_pairs`."""
-        finder, (first, second) = PlanPathFinder(self.floor_plan, SPEED_OF_SOUND), self._ends
-        found = [finder.find(self.probes[at], self.probes[second[first == at]]) for at in np.unique(first)]
-        return SoundPaths(
-            *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in found), strict=True))
-        )
-
-    @property
-    def _direct_power(self) -> _Floats:
-        """(pair, 1) power of the direct sound along its path, round corners if necessary, without the loss at
-        corners."""
-        return np.asarray(self._paths.length_m[:, None] ** -2)
-
-    @property
-    def _straight_power(self) -> _Floats:
-        """(pair, 1) power of the direct sound along a straight line, through all obstacles."""
-        return np.asarray((self._paths.length_m - self._paths.excess_m)[:, None] ** -2)
-
-    @property
-    def _passage_m2(self) -> float:
-        """The mean area of the openings; without any, the area of the narrowest gap beside a convex corner of the
-        walls."""
-        geometry = self.scene.geometry
-        widths = [np.subtract(opening.start, opening.end) for opening in geometry.openings]
-        if widths:
-            return float(np.linalg.norm(widths, axis=-1).mean() * geometry.height_m)
-        return float(_narrowest_m(self.floor_plan) * geometry.height_m)
-
-    @cached_property
-    def _reverberant_power(self) -> _Floats:
-        """(pair, band) power of the reverberation. For pairs not in sight it is that of a coupled room, reduced by the
-        share S / (S + A) of the passage (Cremer & Mueller, Principles and Applications of Room Acoustics, vol. 1, 1982,
-        sec. II.1)."""
-        power = np.tile(self.room.reflected_power(1), (len(self._paths.length_m), 1))
-        if not self.is_one_room:
-            passage, area = self._passage_m2, self.room.surface_m2 * self.room.absorption / 2
-            power[~self._paths.in_sight] *= passage / (passage + area)
-        return power
-
-
-def _told(change: Change, reason: str) -> Prediction:
-    return Prediction(change.jnd, change.parameter, reason)
-
-
-def _level_change_jnd(more: _Floats, other: _Floats) -> float:
-    """Return the largest change in level from adding one power to another, in JND."""
-    return float(np.max(power_to_db(1 + more / other))) / _LEVEL_DB
-
-
-def _narrowest_m(plan: FloorPlan) -> float:
-    """Return the narrowest gap from a corner that sound bends round to a wall that does not end there."""
-    start, end = plan.walls[:, 0], plan.walls[:, 1]
-    along = end - start
-    narrowest = np.inf
-    for corner in plan.bend_corners:
-        share = np.clip(np.sum((corner - start) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
-        distance = np.linalg.norm(start + share[:, None] * along - corner, axis=-1)
-        narrowest = min(narrowest, float(distance[distance > 1e-6].min()))
-    return narrowest

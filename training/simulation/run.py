@@ -17,13 +17,13 @@ from rich.progress import Progress
 from training.data.dataset import Dataset
 from training.data.dataset_check import DatasetError
 from training.data.door_states import DoorStates
-from training.data.levels.level_scene import LevelScene, read_scene
+from training.data.levels.level_scene import read_scene
 from training.data.simulated_scene import SimulatedScene
 from training.data.simulation_plan import SimulationPlan, overrides_among
 from training.parallel.jobs import IsOver, Job, Jobs
 from training.simulation.half_precision import to_half
 from training.simulation.pairs import PairSimulation
-from training.simulation.planner import plan_of_level, planner_of
+from training.simulation.planner import planner_of
 
 _Takes = list[dict[int, npt.NDArray[np.float16]]]
 
@@ -62,12 +62,7 @@ def simulate(
     folder that contains another scene, or other probes than `simulation`.
     """
     scene = read_scene(scene_path)
-    if simulation is not None:
-        plan = simulation.plan
-    elif isinstance(scene, LevelScene):
-        plan = plan_of_level(scene)
-    else:
-        plan = planner_of(scene, seed).plan(overrides_among(scene.effects))
+    plan = planner_of(scene, seed).plan(overrides_among(scene.effects)) if simulation is None else simulation.plan
     dataset = Dataset.create(folder, scene_path, seed, plan)
     remaining = dataset.remaining()
     task = progress.add_task("simulating", total=len(dataset.probes), completed=len(dataset.probes) - len(remaining))

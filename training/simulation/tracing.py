@@ -109,10 +109,13 @@ class RoomTracer:
         least_order: int = 1,
         surroundings: MeshSurroundings | None = None,
         through_walls: bool = False,
+        few_rays: bool = False,
+        only_through: bool = False,
     ) -> None:
         """Specular paths of up to `image_order` reflections are found as images; those of fewer than `least_order` are
         left out. In a mesh, the order is at most 1; its `surroundings` may be given if there are some already, and
-        energy goes `through_walls` by the masses of its materials. In a floor plan, none does."""
+        energy goes `through_walls` by the masses of its materials. In a floor plan, none does. With `few_rays`, nothing
+        is prepared that pays for many rays only; with `only_through`, rays bring only what went through walls."""
         self._air = air
         self._receivers = np.asarray(receivers, dtype=np.float64)
         self._duration_s = duration_s
@@ -131,6 +134,8 @@ class RoomTracer:
                 arrival_directions=arrival_directions,
                 tree=here.tree,
                 losses_db=wall_losses_db(geometry.in_order) if through_walls else None,
+                few_rays=few_rays,
+                only_through=only_through,
             )
         else:
             self._images = _PlanImages(geometry, self._receivers, least_order=least_order, order=image_order)
@@ -152,8 +157,12 @@ class RoomTracer:
         duration_s: float | None = None,
         image_order: int | None = None,
         least_order: int = 1,
+        arrival_directions: _Floats | None = None,
+        few_rays: bool = False,
+        only_through: bool = False,
     ) -> "RoomTracer":
-        """A tracer for the scene, with the effects of the plan. Duration and image order default to the plan's."""
+        """A tracer for the scene, with the effects of the plan. Duration and arrival directions default to those of the
+        scene, and the image order to the plan's."""
         settings = scene.simulation
         geometry: Geometry | MeshGeometry
         if isinstance(scene, LevelScene):
@@ -167,10 +176,14 @@ class RoomTracer:
             receivers,
             duration_s=settings.duration_s if duration_s is None else duration_s,
             image_order=plan.image_order if image_order is None else image_order,
-            arrival_directions=sphere_directions(settings.arrival_directions),
+            arrival_directions=(
+                sphere_directions(settings.arrival_directions) if arrival_directions is None else arrival_directions
+            ),
             least_order=least_order,
             surroundings=surroundings,
             through_walls=plan.transmission,
+            few_rays=few_rays,
+            only_through=only_through,
         )
 
     def trace(self, emitter: _Floats, *, rays: int, rng: np.random.Generator) -> list[Arrivals]:

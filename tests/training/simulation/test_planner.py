@@ -10,8 +10,8 @@ from server.scene.geometry import Opening
 from training.data.scene_file import SceneFile, SceneFileError
 from training.data.simulation_plan import SimulatedEffect, SimulationPlan, overrides_among
 from training.simulation import planner
+from training.simulation.plan_predictions import PlanPredictions
 from training.simulation.planner import THRESHOLD, SimulationPlanner, planner_of
-from training.simulation.predictions import Predictions
 
 TWO_ROOMS = ((0, 0), (3, 0), (3, 4), (3.2, 4), (3.2, 0), (7, 0), (7, 5), (0, 5))
 
@@ -41,7 +41,7 @@ def two_rooms(scene, **walls):
 
 def predicted(scene):
     """Kept by `conftest.py` for the tests that ask again."""
-    return planner.Predictions(scene, scene.probe_positions(0))
+    return planner.PlanPredictions(scene, scene.probe_positions(0))
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def decided(planned):
 
 def test_the_same_scene_has_the_same_plan(box):
     probes = box.probe_positions(3)
-    one, other = (SimulationPlanner(Predictions(box, probes)).plan({}) for _ in range(2))
+    one, other = (SimulationPlanner(PlanPredictions(box, probes)).plan({}) for _ in range(2))
     assert one == other
 
 
@@ -212,7 +212,7 @@ def test_air_matters_less_where_walls_take_most(box):
     """But not less than the threshold: at 8 kHz air takes 0.1 dB a metre, and the first reflections that are all that
     decays go some metres further than the direct sound."""
     live, dead = (
-        planner.Predictions(with_materials(box, absorption=share), box.probe_positions(0)).air_absorption(
+        planner.PlanPredictions(with_materials(box, absorption=share), box.probe_positions(0)).air_absorption(
             has_rays=has_rays, scatters=has_rays
         )
         for share, has_rays in ((0.05, True), (0.99, False))
@@ -244,7 +244,7 @@ def test_only_thin_walls_let_anything_heard_through(box, decided):
 def test_fewer_rays_do_in_a_smaller_room(box):
     many = box.model_copy(update={"simulation": box.simulation.model_copy(update={"rays": 10**9})})
     larger = with_geometry(many, corners=((0, 0), (8, 0), (8, 6), (0, 6)))
-    rays = [planner.Predictions(scene, box.probe_positions(0)).rays() for scene in (many, larger)]
+    rays = [planner.PlanPredictions(scene, box.probe_positions(0)).rays() for scene in (many, larger)]
     assert rays[0] < rays[1] < 10**9
     assert predicted(box).rays() == box.simulation.rays  # never more than the file allows
 

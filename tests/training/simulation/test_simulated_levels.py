@@ -16,14 +16,14 @@ from server.scene.bundle import Bundle
 from server.scene.geometry import Material
 from server.scene.mesh_geometry import MeshGeometry
 from training.cli.main import app
-from training.data.dataset import Dataset, DatasetError
+from training.data.dataset import GEOMETRIC_ORDER, Dataset, DatasetError
 from training.data.levels.level_scene import LevelScene, SceneDoor, read_scene
 from training.data.levels.probe_places import probe_places
 from training.data.levels.walkable import reached_ground
 from training.data.scene_file import SceneFile, SceneFileError
+from training.data.simulation_plan import SimulationPlan
 from training.parallel.jobs import open_jobs
 from training.simulation.direct_paths import DirectPaths
-from training.simulation.planner import plan_of_level
 from training.simulation.rays import sphere_directions
 from training.simulation.references import References
 from training.simulation.run import prepared, simulate
@@ -40,6 +40,10 @@ def level_of(doors=(), leaves=()):
     base = LevelScene.of_plan(APARTMENT.model_copy(update={"id": "level", "probes": PROBES, "simulation": BRIEF}))
     geometry = base.file.geometry.model_copy(update={"doors": doors})
     return LevelScene(base.file.model_copy(update={"geometry": geometry}), base.mesh, leaves)
+
+
+def everything_in(level):
+    return SimulationPlan.everything(GEOMETRIC_ORDER, level.simulation.rays, transmission=level.has_mass)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +75,7 @@ def test_a_scene_file_of_another_name_is_what_is_simulated_and_bundled(folder, t
     variant.write_text(text.replace('id = "level"', 'id = "variant"'), encoding="utf-8")
     assert read_scene(variant).id == "variant"
     assert read_scene(tmp_path).id == "level"
-    created = Dataset.create(tmp_path / "data", variant, 3, plan_of_level(read_scene(variant)))
+    created = Dataset.create(tmp_path / "data", variant, 3, everything_in(read_scene(variant)))
     assert created.place.id == Dataset.open(created.folder, finished=False).place.id == "variant"
     result = CliRunner().invoke(app, ["bundle-level", str(variant), "-o", str(tmp_path / "bundle")])
     assert result.exit_code == 0, result.output
@@ -174,7 +178,7 @@ def test_an_interrupted_simulation_goes_on_and_another_level_is_refused(dataset,
 
 def test_a_simulation_that_was_begun_keeps_its_probes(folder, tmp_path, monkeypatch):
     """Another version of the program may place them elsewhere."""
-    begun = Dataset.create(tmp_path, folder, 3, plan_of_level(level_of()))
+    begun = Dataset.create(tmp_path, folder, 3, everything_in(level_of()))
     elsewhere = level_of().probe_positions(4)[: len(begun.probes)]
     monkeypatch.setattr(LevelScene, "probe_positions", lambda *_: elsewhere)
     other = prepared(level_of(), seed=3, plan=begun.effects)
@@ -192,7 +196,7 @@ def test_a_simulation_that_was_begun_keeps_its_probes(folder, tmp_path, monkeypa
 def test_a_level_sounds_as_its_plan():
     """Images and direct paths are the plan's; rays bring its energy, and that of images by more surfaces than one."""
     level, probes = level_of(), level_of().probe_positions(1)
-    plan = plan_of_level(level)
+    plan = everything_in(level)
     of_plan = APARTMENT.model_copy(update={"simulation": BRIEF})
     here, there = (RoomTracer.of(scene, plan, probes[1:]) for scene in (of_plan, level))
     for one, other in zip(here.images(probes[0]), there.images(probes[0]), strict=True):
@@ -245,7 +249,7 @@ def test_doors_stand_as_open_as_they_are():
     assert own.surface_mass_kg_m2 == 12.0
     assert shut.place.materials["walls"].surface_mass_kg_m2 == APARTMENT.geometry.materials.walls.surface_mass_kg_m2
     # What goes through the shut leaf is heard, by its mass.
-    positions, _ = DirectPaths.of(shut, plan_of_level(shut)).images(hall, room)
+    positions, _ = DirectPaths.of(shut, everything_in(shut)).images(hall, room)
     assert any(np.allclose(position, hall) for position in positions)
 
 
@@ -280,7 +284,7 @@ def test_doors_with_which_there_is_more_than_a_mesh_has_are_refused_by_name(tmp_
 
 def test_what_rays_bring_behind_a_shut_door_goes_through_its_leaf():
     level = level_of((door(0.0),), (leaf(),))
-    plan, inside = plan_of_level(level), np.array([2.0, 2.5, 1.5])
+    plan, inside = everything_in(level), np.array([2.0, 2.5, 1.5])
     receivers = np.array([inside + 0.5, (6.0, 2.5, 1.5)])
 
     def energy(**effects):
@@ -311,23 +315,16 @@ def test_a_mesh_has_images_by_one_surface_only():
         )
 
 
-def test_the_plan_of_a_level_leaves_nothing_out(folder):
-    level = read_scene(folder)
-    plan = plan_of_level(level)
-    assert plan.scattering
-    assert plan.tail_start_s is None
-    assert prepared(level, seed=1, plan=plan).tail is None
-
-
 def test_the_command_line_takes_a_folder(folder, tmp_path):
     runner = CliRunner()
     planned = runner.invoke(app, ["plan", str(folder)])
     assert planned.exit_code == 0
     assert "probes" in planned.output
-    assert "levels are simulated with everything on" in " ".join(planned.output.split())
+    assert "by a trial" in " ".join(planned.output.split())
     result = runner.invoke(app, ["simulate", str(folder), "-o", str(tmp_path / "data"), "--workers", "1"])
     assert result.exit_code == 0, result.output
     assert "pairs to train on" in result.output
     assert (tmp_path / "data" / "geometry.npz").exists()
-    refused = runner.invoke(app, ["simulate", str(folder), "-o", str(tmp_path / "x"), "--effects", "scattering=off"])
+    refused = runner.invoke(app, ["plan", str(folder), "--effects", "early_reflections=on"])
     assert refused.exit_code != 0
+    assert "effects.early_reflections: cannot be on in a level" in str(refused.exception)

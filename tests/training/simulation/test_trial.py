@@ -9,8 +9,8 @@ from server.acoustics.decibels import db_to_power
 from server.scene.geometry import Geometry
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.scene_file import HISTOGRAM_BIN_S, SceneFile
+from training.simulation.plan_predictions import PlanPredictions
 from training.simulation.planner import planner_of
-from training.simulation.predictions import Predictions
 from training.simulation.rays import RayTracer, sphere_directions
 from training.simulation.trial import Trial, _root_mean_square
 from training.trials.reverberation import reverberation_time_s
@@ -31,7 +31,7 @@ def times_by_many_rays_s(scene: SceneFile, geometry: Geometry, rays: int = 150_0
 def test_long_rooms_ring_on_by_rays_of_which_there_are_few():
     """Of sixty metres of tunnel few rays told less than half of the reverberation."""
     (tunnel,) = (each for each in rooms() if each.id == "tunnel")
-    trial = Trial(tunnel, tunnel.probe_positions(0))
+    trial = Trial.of_plan(tunnel, tunnel.probe_positions(0))
     expected = times_by_many_rays_s(tunnel, tunnel.geometry)
     np.testing.assert_allclose(trial.reverberation_time_s, expected, rtol=0.25)
 
@@ -48,14 +48,14 @@ def test_places_of_one_small_room_share_their_late_sound(name):
 )
 def test_a_tail_of_a_room_that_mixes_well_needs_few_rays(scene, most):
     scene = SceneFile.read(SCENES / f"{scene}.toml")
-    predictions = Predictions(scene, scene.probe_positions(0))
+    predictions = PlanPredictions(scene, scene.probe_positions(0))
     assert 0 < predictions.trial.tail_rays(predictions.tail_start_s, 0.05) < most
     assert predictions.tail_rays() == scene.simulation.rays
 
 
 def test_a_tail_needs_more_rays_where_few_of_them_run_level():
     corridor = SceneFile.read(SCENES / "own" / "corridor-20m.toml")
-    predictions = Predictions(corridor, corridor.probe_positions(0))
+    predictions = PlanPredictions(corridor, corridor.probe_positions(0))
     needed = predictions.trial.tail_rays(predictions.tail_start_s, 0.05)
     assert needed > 10 * corridor.simulation.rays
     assert predictions.trial.tail_rays(predictions.tail_start_s, 0.1) == pytest.approx(needed / 4)

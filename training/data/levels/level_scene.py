@@ -8,7 +8,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, count
 from pathlib import Path
@@ -29,7 +29,7 @@ from server.scene.manifest import Air, Start
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.levels.probe_places import probe_places, require_few_cells
 from training.data.levels.walkable import Ground, reached_ground
-from training.data.scene_file import FEWEST_PROBES, Probes, SceneFile, SceneFileError, Simulation
+from training.data.scene_file import FEWEST_PROBES, NamedEffects, Probes, SceneFile, SceneFileError, Simulation
 
 SCENE_FILE, MESH_FILE = "scene.toml", "geometry.npz"
 _SPEED_OF_SOUND = 343.0
@@ -71,10 +71,10 @@ class LevelGeometry(Strict):
 
     @model_validator(mode="after")
     def _names_once(self) -> Self:
-        for field in ("doors", "emitters", "spawns"):
-            names = [each.name for each in getattr(self, field)]
+        for table in ("doors", "emitters", "spawns"):
+            names = [each.name for each in getattr(self, table)]
             if twice := [name for name in names if names.count(name) > 1]:
-                raise ValueError(f"{field}: two are called {twice[0]!r}: name them apart")
+                raise ValueError(f"{table}: two are called {twice[0]!r}: name them apart")
         return self
 
 
@@ -89,15 +89,19 @@ class LevelFile(Strict):
     start: Start
     probes: Probes
     simulation: Simulation
+    effects: NamedEffects = Field(default_factory=dict)
+    """As in the scene file of a floor plan."""
 
 
 @dataclass(frozen=True)
 class LevelScene:
-    """A level's folder, read. `doors` are the leaves' meshes in the order of `file.geometry.doors`."""
+    """A level's folder, read. `doors` are the leaves' meshes in the order of `file.geometry.doors`. `known` are its
+    surroundings, if they were found already."""
 
     file: LevelFile
     mesh: TriangleMesh
     doors: tuple[TriangleMesh, ...]
+    known: MeshSurroundings | None = field(default=None, repr=False, compare=False)
 
     @property
     def id(self) -> str:
@@ -112,10 +116,20 @@ class LevelScene:
         return self.file.simulation
 
     @property
+    def effects(self) -> dict[str, bool]:
+        return self.file.effects
+
+    @property
     def identity(self) -> dict[str, Any]:
-        """What the file says, and digests of the meshes."""
+        """What the file says, and digests of the meshes. Files without `effects` are those of earlier versions too."""
         meshes = [hashlib.sha256(mesh.to_bytes()).hexdigest() for mesh in (self.mesh, *self.doors)]
-        return {**self.file.model_dump(mode="json"), "meshes": meshes}
+        said = self.file.model_dump(mode="json", exclude=None if self.effects else {"effects"})
+        return {**said, "meshes": meshes}
+
+    @property
+    def has_mass(self) -> bool:
+        """Whether any surface lets sound through."""
+        return any(material.surface_mass_kg_m2 for material in self.place.materials.values())
 
     @cached_property
     def place(self) -> MeshGeometry:
@@ -125,14 +139,14 @@ class LevelScene:
         mesh = TriangleMesh.joined([self.mesh, *at])
         return MeshGeometry(mesh, {name: materials[name] for name in mesh.materials})
 
-    def with_doors(self, openness: Sequence[float]) -> "LevelScene":
-        """The same level with its doors so far open, in their order."""
+    def with_doors(self, openness: Sequence[float], known: MeshSurroundings | None = None) -> "LevelScene":
+        """The same level with its doors so far open, in their order. `known` are its surroundings then."""
         geometry = self.file.geometry
         doors = [
             door.model_copy(update={"openness": share}) for door, share in zip(geometry.doors, openness, strict=True)
         ]
         moved = geometry.model_copy(update={"doors": tuple(doors)})
-        return replace(self, file=self.file.model_copy(update={"geometry": moved}))
+        return replace(self, file=self.file.model_copy(update={"geometry": moved}), known=known)
 
     @cached_property
     def leaves(self) -> tuple[tuple[DoorLeaf, ...], Mapping[str, Material]]:
@@ -156,6 +170,8 @@ class LevelScene:
 
     @cached_property
     def surroundings(self) -> MeshSurroundings:
+        if self.known is not None:
+            return self.known
         return MeshSurroundings(self.place.mesh, open_sky=self.file.geometry.open_sky)
 
     @cached_property
