@@ -12,9 +12,9 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
-from server.core.errors import NafirError
+from server.core.stores import Store
 from server.scene.bundle import MANIFEST_FILE, MOST_FILE_BYTES, MOST_MANIFEST_BYTES
 
 _logger = logging.getLogger(__name__)
@@ -49,14 +49,7 @@ class BundleStore:
     """
 
     def __init__(self, url: str) -> None:
-        try:
-            import fsspec
-        except ImportError as exc:
-            raise NafirError("bundle_url: needs `pip install 'nafir[store]'`") from exc
-        try:
-            self._system, self._root = fsspec.url_to_fs(url)
-        except (ImportError, ValueError) as exc:
-            raise NafirError(f"bundle_url: {exc}") from exc
+        self._store = Store(url, "bundle_url")
         self._folder = Path()
         self._taken: dict[str, _Files] = {}
         self._problems: dict[str, str] = {}
@@ -79,7 +72,7 @@ class BundleStore:
     @property
     def name(self) -> str:
         """The store's address without a password."""
-        return str(self._system.unstrip_protocol(self._root))
+        return self._store.name
 
     def fetch(self) -> None:
         """Copy what is new or has changed, and remove what has gone. If the store cannot be read, all stays as it
@@ -99,16 +92,14 @@ class BundleStore:
                     self._problems[name] = f"left out, {name}: {exc}"
         for name, problem in self._problems.items():
             if before.get(name) != problem:
-                _logger.error("bundles of %s: %s", self.name, problem)
+                _logger.error("bundles of %s: %s", self.name, self._store.told(problem))
 
     def _folders(self) -> dict[str, str]:
         """Paths of the store's folders by name."""
-        self._system.invalidate_cache()
         found = {}
-        for entry in self._system.ls(self._root, detail=True):
-            name = _last(entry["name"])
-            if entry["type"] == "directory" and _NAME.fullmatch(name):
-                found[name] = str(entry["name"])
+        for entry in self._store.list():
+            if entry.is_folder and _NAME.fullmatch(entry.name):
+                found[entry.name] = entry.path
         if len(found) > MOST_BUNDLES:
             raise _StoreError(f"there are {len(found)} folders; a server takes {MOST_BUNDLES}")
         return dict(sorted(found.items()))
@@ -141,12 +132,13 @@ class BundleStore:
     def _files(self, path: str) -> dict[str, _File]:
         """The files of a folder. Raises _StoreError for more, or larger ones, than a bundle has."""
         found, size_bytes = {}, 0
-        for entry in self._system.ls(path, detail=True):
-            name = _last(entry["name"])
-            if entry["type"] != "file" or not _NAME.fullmatch(name):
+        for entry in self._store.list(path):
+            if not entry.is_file or not _NAME.fullmatch(entry.name):
                 continue
-            found[name] = _File(str(entry["name"]), _size_bytes(entry), str(self._system.ukey(entry["name"])))
-            size_bytes += found[name].size_bytes
+            if entry.size_bytes is None:
+                raise _StoreError(f"{entry.name}: the store does not say its size")
+            found[entry.name] = _File(entry.path, entry.size_bytes, self._store.key(entry.path))
+            size_bytes += entry.size_bytes
             if len(found) > MOST_FILES:
                 raise _StoreError(f"has more than {MOST_FILES} files")
         if size_bytes > MOST_FILE_BYTES + MOST_MANIFEST_BYTES:
@@ -158,17 +150,6 @@ class BundleStore:
         if before == file:
             shutil.copy2(self.copies / bundle / name, target)
             return
-        self._system.get_file(file.path, str(target))
+        self._store.get(file.path, str(target))
         if target.stat().st_size != file.size_bytes:
             raise _StoreError(f"{name} has {target.stat().st_size} bytes in place of {file.size_bytes}")
-
-
-def _last(path: str) -> str:
-    return path.rstrip("/").rpartition("/")[2]
-
-
-def _size_bytes(entry: Mapping[str, Any]) -> int:
-    size = entry.get("size")
-    if not isinstance(size, int) or size < 0:
-        raise _StoreError(f"{_last(entry['name'])}: the store does not say its size")
-    return size
