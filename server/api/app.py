@@ -5,10 +5,11 @@ import dataclasses
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import get_args
 
 from fastapi import FastAPI, Response
@@ -38,8 +39,10 @@ from server.api.uploads import Uploads
 from server.assets.clip_store import ClipStore
 from server.assets.clips import Clip
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
+from server.assets.shared_clips import SharedClips
 from server.assets.upload_decoder import DecodingLimits
 from server.core.entity_tags import fingerprint
+from server.core.stores import Store
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.effect_costs import measure_costs
 from server.planning.places import place_of_field
@@ -100,12 +103,13 @@ def create_app(
     are the processes of which this is one.
 
     Raises NafirError for files of keys that cannot be used, for traces without the extra `otel`, and for a store of
-    bundles without the extra `store`. Without `scenes` or `hrtfs` they are loaded at start-up, which raises BundleError
-    for a damaged bundle and HrtfError for a damaged HRTF file.
+    bundles or clips without the extra `store`. Without `scenes` or `hrtfs` they are loaded at start-up, which raises
+    BundleError for a damaged bundle and HrtfError for a damaged HRTF file.
     """
     drain = Drain(settings.drain_s) if drain is None else drain
     end_traces = None if settings.traces_url is None else begin_traces(settings.traces_url)
     store = None if settings.bundle_url is None else BundleStore(settings.bundle_url)
+    clips = None if settings.clips_url is None else Store(settings.clips_url, "clips_url")
     access = Access.of(settings, own_key=None if peers is None else peers.key)
     refused = RefusedRequests()
     if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
@@ -118,6 +122,7 @@ def create_app(
         loaded = dict(await asyncio.to_thread(load) if scenes is None else scenes)
         with (
             store or nullcontext(),
+            _folder_of_clips(settings) as clips_folder,
             Workers(settings.ir_workers, "nafir-ir", initializer=become_background) as workers,
             ResponseCache(
                 # One more than there are IR workers. Maps never take the last one, so that cheap requests have it.
@@ -152,7 +157,7 @@ def create_app(
                 responses=responses,
                 readiness=Readiness(drain, ThreadWatch((audio, workers.pool, workers.ways, responses.pool, encoders))),
                 encoders=encoders,
-                uploads=_uploads(settings),
+                uploads=_uploads(settings, clips_folder, clips),
                 peers=peers,
                 access=access,
                 refused_requests=refused,
@@ -167,6 +172,8 @@ def create_app(
             ]
             if access is not None:
                 tasks.append(asyncio.create_task(access.watch()))
+            if host.uploads is not None:
+                tasks.append(asyncio.create_task(host.uploads.follow()))
             try:
                 yield {"host": host}
             finally:
@@ -215,11 +222,23 @@ def _watched_bundles(
     return None if settings.bundle_folder is None else BundleFolder(settings.bundle_folder, others, keys=keys)
 
 
-def _uploads(settings: Settings) -> Uploads | None:
-    if settings.clips_folder is None:
+def _folder_of_clips(settings: Settings) -> AbstractContextManager[str | Path | None]:
+    """The folder for uploaded clips, or for copies of those in a store; None if there are no uploads."""
+    if settings.clips_url is not None and settings.clips_folder is None:
+        return TemporaryDirectory(prefix="nafir-clips-", ignore_cleanup_errors=True)
+    return nullcontext(settings.clips_folder)
+
+
+def _uploads(settings: Settings, folder: str | Path | None, store: Store | None) -> Uploads | None:
+    if folder is None:
         return None
-    store = ClipStore(settings.clips_folder, quota_bytes=settings.clips_quota_bytes, expires_s=settings.clips_expire_s)
-    return Uploads(store, max_bytes=settings.max_clip_bytes, limits=DecodingLimits(settings.max_clip_s))
+    quota_bytes, expires_s = settings.clips_quota_bytes, settings.clips_expire_s
+    # A folder of its own for each store: clips that were uploaded before there was one stay as they are.
+    path = Path(folder) if store is None else Path(folder) / f"copies-{store.digest}"
+    clips = ClipStore(path, quota_bytes=quota_bytes, expires_s=expires_s)
+    shared = None if store is None else SharedClips(clips, store, quota_bytes=quota_bytes, expires_s=expires_s)
+    limits = DecodingLimits(settings.max_clip_s)
+    return Uploads(clips, max_bytes=settings.max_clip_bytes, limits=limits, shared=shared)
 
 
 def _turn_away(scope: Scope) -> Response | None:

@@ -139,6 +139,10 @@ _SNAPSHOT_PERIOD_S = 3.0
 """Time between two snapshots of a stream: what its client would have to send again if the server was lost."""
 _MOST_DEPARTED_WORK = 4
 """Responses and plans for listeners who have left that may still be computed while another listener comes."""
+_CLIP_WAIT_S = 5.0
+"""Time for an uploaded clip to come from another machine, before its emitter is refused. It comes all the same."""
+_MOST_HELD = 256
+"""Messages that may wait, already read, for a clip to come."""
 _UNCOUNTED: Final = ListenerPose | MoveEmitter | DryBlock | DryPackets | Acknowledge | Ping
 """Messages that do not count as handled (`Snapshot.handled`): they have numbers of their own, or need not be sent
 again."""
@@ -162,6 +166,12 @@ def loaded_clip(clips: ClipLibrary, uploads: ClipStore | None, name: str) -> Dry
     if audio is None:
         raise RequestError("server_busy", f"too many clips are in use to play {name}", field="clip", retry_after_s=1)
     return audio
+
+
+def _forget(task: asyncio.Task[None] | asyncio.Task[str | bytes]) -> None:
+    """Nothing is reported of a task that nothing waits for any more."""
+    if not task.cancelled():
+        task.exception()
 
 
 def _first_blocks(outgoing: Iterable[Outgoing]) -> Iterator[TimedBlock]:
@@ -461,6 +471,10 @@ class Connection:
         self._outgoing: deque[Outgoing] = deque()
         self._has_outgoing = asyncio.Event()
         self._is_sending = self._is_handling = False
+        self._held: deque[str | bytes] = deque()
+        """Messages that were read while another was being handled."""
+        self._receiving: asyncio.Task[str | bytes] | None = None
+        """The next message, if it was awaited while another was being handled."""
         self._capacity = MAX_WAITING_ANSWERS
         self._goodbye: Goodbye | None = None
         """Why the connection is to end."""
@@ -574,6 +588,8 @@ class Connection:
                 return None
             steps, others = self._steps(hello, levels, offer)
             self._require_seats(hello)
+            if lost is not None:
+                await self._load_clips(lost.snapshot)
         except RequestError as refusal:
             return _refused(refusal)
         place = None if lost is None else lost.kept.place
@@ -599,6 +615,25 @@ class Connection:
                 host.kept.close(self._token)
             if not place.is_kept:
                 host.admission.leave(place)
+
+    async def _load_clips(self, snapshot: Snapshot) -> None:
+        """Load what was uploaded and plays in a lost stream, as far as it comes in time: another server may have had
+        the stream. What is not loaded is refused when the stream is restored."""
+        scene, uploads = self._scene, self._host.uploads
+        if scene is None or uploads is None:
+            return
+
+        async def load(name: str) -> None:
+            with contextlib.suppress(RequestError):
+                await uploads.bring(name)
+                await asyncio.to_thread(load_clip, scene.clips, uploads.store, name)
+
+        names = {kept.emitter.clip for kept in snapshot.emitters if kept.emitter.clip is not None}
+        rate = scene.clips.sample_rate
+        missing = [name for name in names if is_upload(name) and uploads.store.loaded(name, rate) is None]
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLIP_WAIT_S):
+                await asyncio.gather(*map(load, missing))
 
     def _require_seats(self, hello: Hello) -> None:
         """Raises RequestError too_many_listeners."""
@@ -918,6 +953,8 @@ class Connection:
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)
+            if self._receiving is not None:
+                self._receiving.cancel()
 
     def _may_come_back(self, ending: Goodbye | None) -> bool:
         """Whether the client has neither said goodbye nor lost its stream by a fault."""
@@ -982,7 +1019,7 @@ class Connection:
             self._fast_path.listen(self._handle_at_once)
         with contextlib.suppress(WebSocketDisconnect):
             while True:
-                data = await self._receive()
+                data = await self._next_message()
                 self._is_handling = True
                 await self._handle(data, stream, hello)
                 self._is_handling = False
@@ -1008,6 +1045,8 @@ class Connection:
         try:
             message = self._parse(data)
             if isinstance(message, AddEmitter) and message.clip is not None:
+                if is_upload(message.clip):
+                    await self._bring_clip(message.clip, stream)
                 # Decoded here, off the event loop, so that the audio thread need not wait.
                 assert self._scene is not None
                 await asyncio.to_thread(load_clip, self._scene.clips, self._host.clip_store, message.clip)
@@ -1018,6 +1057,59 @@ class Connection:
         except RequestError as refusal:
             self._refuse(refusal, message or data)
         self._handled += _counts(message, data)
+
+    async def _bring_clip(self, name: str, stream: Stream) -> None:
+        """Have an uploaded clip on this machine. While it comes from elsewhere, the stream goes on: blocks are
+        acknowledged, and other messages wait their turn. Raises RequestError unknown_clip, store_unreachable, or
+        server_busy if it takes long."""
+        uploads = self._host.uploads
+        if uploads is None or uploads.shared is None:
+            return
+        bringing = asyncio.create_task(uploads.bring(name))
+        bringing.add_done_callback(_forget)
+        try:
+            async with asyncio.timeout(_CLIP_WAIT_S):
+                while not bringing.done():
+                    if len(self._held) >= _MOST_HELD:
+                        await asyncio.wait({bringing})
+                        break
+                    if self._receiving is None:
+                        self._receiving = asyncio.create_task(self._receive())
+                        self._receiving.add_done_callback(_forget)
+                    await asyncio.wait({bringing, self._receiving}, return_when=asyncio.FIRST_COMPLETED)
+                    if self._receiving.done():
+                        receiving, self._receiving = self._receiving, None
+                        self._handle_early(receiving.result(), stream)
+                bringing.result()
+        except TimeoutError:
+            coming = f"clip {name} is on its way from another machine: ask again in 1 s"
+            raise RequestError("server_busy", coming, field="clip", status=503, retry_after_s=1) from None
+        finally:
+            bringing.cancel()
+
+    def _handle_early(self, data: str | bytes, stream: Stream) -> None:
+        """Handle a message before those that came earlier if it may, and hold it otherwise."""
+        try:
+            message = self._parse(data)
+        except RequestError:
+            self._held.append(data)
+            return
+        if not isinstance(message, Acknowledge | Ping):
+            self._held.append(data)
+            return
+        try:
+            self._pass_on(message, stream)
+        except RequestError as refusal:
+            self._refuse(refusal, message)
+
+    async def _next_message(self) -> str | bytes:
+        """The next message in the order in which they came."""
+        if self._held:
+            return self._held.popleft()
+        if self._receiving is None:
+            return await self._receive()
+        receiving, self._receiving = self._receiving, None
+        return await receiving
 
     async def _add_listener(self, message: AddListener, stream: Stream, hello: Hello) -> None:
         """Make a session for another listener, off the event loop, and hand it to the stream. Messages that come

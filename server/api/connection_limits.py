@@ -40,8 +40,8 @@ class ConnectionLimits:
             max_body_bytes=settings.max_body_bytes,
             request_timeout_s=settings.request_timeout_s,
             response_timeout_s=settings.response_timeout_s,
-            max_upload_bytes=settings.max_body_bytes if settings.clips_folder is None else settings.max_clip_bytes,
-            upload_timeout_s=settings.request_timeout_s if settings.clips_folder is None else settings.upload_timeout_s,
+            max_upload_bytes=settings.max_clip_bytes if settings.takes_clips else settings.max_body_bytes,
+            upload_timeout_s=settings.upload_timeout_s if settings.takes_clips else settings.request_timeout_s,
             max_connections=settings.max_connections,
             max_connections_per_address=min(settings.max_connections_per_address, settings.max_connections),
         )

@@ -45,6 +45,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "server_busy": "503: too many computations wait, or no stream has room; ask again after `Retry-After`",
     "server_draining": "503: the server is shutting down; ask again there or elsewhere",
     "storage_failed": "507: the disk of the server is full, or cannot be written to",
+    "store_unreachable": "503: the store of uploaded clips does not answer, or refuses; ask again after `Retry-After`",
     "test_full": "503: a listening test takes no more listeners",
     "too_many_connections": "503: every connection is in use",
     "too_many_emitters": "422: a plan is asked for with more emitters than a stream may have",
@@ -65,7 +66,7 @@ PROBLEM_CODES: Final[Mapping[str, str]] = {
     "unknown_scene": "404: there is no scene of this id",
     "unsupported_media_type": "415: the body is of another type than the route reads",
     "unsupported_sample_rate": "404: no stream has this sample rate; the message lists those there are",
-    "uploads_off": "403: the server takes no clips; its operator can name a folder for them",
+    "uploads_off": "403: the server takes no clips; its operator can name a folder or a store for them",
     "upgrade_required": "426: the address is a WebSocket; connect with ws:// or wss://",
 }
 """Meanings by code. Each begins with the HTTP status."""

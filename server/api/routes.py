@@ -496,7 +496,10 @@ def _schema_text() -> bytes:
 @api.get("/clips")
 async def clips(request: Request) -> dict[str, Any]:
     """Clips that emitters can play, those that were uploaded among them."""
-    named = await anyio.to_thread.run_sync(_clips_by_name, _host(request))
+    host = _host(request)
+    uploaded = () if host.uploads is None else await host.uploads.clips()
+    fixed = await anyio.to_thread.run_sync(_fixed_clips, host)
+    named = {clip.name: clip for clip in (*uploaded, *fixed)}
     return {"clips": [named[name] for name in sorted(named)]}
 
 
@@ -525,7 +528,8 @@ async def upload_clip(
     same name."""
     uploads = _host(request).uploads
     if uploads is None:
-        raise RequestError("uploads_off", "this server takes no clips: set NAFIR_CLIPS_FOLDER", status=403)
+        off = "this server takes no clips: set NAFIR_CLIPS_FOLDER or NAFIR_CLIPS_URL"
+        raise RequestError("uploads_off", off, status=403)
     _require_audio(request)
     try:
         clip, is_new = await uploads.receive(request.stream(), title)
@@ -538,10 +542,13 @@ async def upload_clip(
 @api.get("/clips/{clip}")
 async def one_clip(request: Request, clip: str) -> Clip:
     """One clip, as in the list of all."""
-    named = await anyio.to_thread.run_sync(_clips_by_name, _host(request))
-    if clip not in named:
-        raise UnknownClipError(clip)
-    return named[clip]
+    host = _host(request)
+    if host.uploads is not None and is_upload(clip):
+        return await host.uploads.describe(clip)
+    for fixed in await anyio.to_thread.run_sync(_fixed_clips, host):
+        if fixed.name == clip:
+            return fixed
+    raise UnknownClipError(clip)
 
 
 @api.get("/clips/{clip}/audio", response_class=Response, responses={200: _CLIP_TYPES})
@@ -550,6 +557,8 @@ async def clip_audio(request: Request, clip: str) -> Response:
     host = _host(request)
     if not host.settings.offer_bundles:
         raise RequestError("bundle_not_offered", "this server does not give its sound files away", status=403)
+    if host.uploads is not None and is_upload(clip):
+        await host.uploads.bring(clip)
     file = await anyio.to_thread.run_sync(_clip_file, host, clip)
     try:
         stat_result = await anyio.to_thread.run_sync(file.stat)
@@ -575,18 +584,17 @@ def _clip_file(host: StreamHost, clip: str) -> pathlib.Path:
 async def delete_clip(request: Request, clip: str) -> Response:
     """Delete an uploaded clip. Emitters that play it go on."""
     host = _host(request)
-    if host.clip_store is not None and is_upload(clip):
-        await anyio.to_thread.run_sync(host.clip_store.remove, clip)
+    if host.uploads is not None and is_upload(clip):
+        await host.uploads.remove(clip)
         return Response(status_code=204)
-    if clip in await anyio.to_thread.run_sync(_clips_by_name, host):
+    if any(fixed.name == clip for fixed in await anyio.to_thread.run_sync(_fixed_clips, host)):
         raise RequestError("fixed_clip", f"clip {clip!r} was not uploaded and stays", field="clip", status=409)
     raise UnknownClipError(clip)
 
 
-def _clips_by_name(host: StreamHost) -> dict[str, Clip]:
-    fixed = (clip for library in set(host.clips.values()) for clip in playable_clips(library))
-    uploaded = () if host.clip_store is None else host.clip_store.clips()
-    return {clip.name: clip for clip in (*uploaded, *fixed)}
+def _fixed_clips(host: StreamHost) -> list[Clip]:
+    """The clips that nobody has uploaded. Those of several sample rates come several times."""
+    return [clip for library in set(host.clips.values()) for clip in playable_clips(library)]
 
 
 @api.get("/hrtfs")

@@ -129,10 +129,15 @@ class Settings(BaseSettings):
     clips: NamedFiles = ()
     """Audio files to offer as clips, named by their stem, besides those that come with the package."""
     clips_folder: Path | None = None
-    """Folder for clips that clients upload with `POST /v1/clips`; it is made if need be. Without it there are no
-    uploads."""
+    """Folder for clips that clients upload with `POST /v1/clips`; it is made if need be. Without it, and without
+    `clips_url`, there are no uploads."""
+    clips_url: str | None = None
+    """Store that fsspec writes to, such as s3://games/clips, for the clips that clients upload: all machines that name
+    it have the same ones. Each keeps copies in `clips_folder`, or else in a folder for temporary files. It needs the
+    extra `store` and the package of the store, such as s3fs."""
     clips_quota_bytes: Annotated[int, Field(ge=2**20)] = 2**30
-    """Bytes that uploaded clips may take together in `clips_folder`, where they are kept decoded: 4 bytes a sample."""
+    """Bytes that uploaded clips may take together in `clips_url`, or else in `clips_folder`, where they are kept
+    decoded: 4 bytes a sample."""
     clips_expire_s: Annotated[float, Field(ge=60)] = 7 * 86_400.0
     """How long a clip is kept after it was uploaded last."""
     max_clip_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 16 * 2**20
@@ -236,6 +241,11 @@ class Settings(BaseSettings):
     def read_bundle_keys(self) -> BundleKeys | None:
         """The keys that bundles have to be signed by; None if any bundle is served. Raises NafirError."""
         return None if self.bundle_keys is None else BundleKeys.read(self.bundle_keys)
+
+    @property
+    def takes_clips(self) -> bool:
+        """Whether clients may upload clips."""
+        return self.clips_folder is not None or self.clips_url is not None
 
     @property
     def is_loopback(self) -> bool:

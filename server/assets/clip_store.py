@@ -14,6 +14,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import Final
+from typing import Final, Self
 
 from server.assets.clips import Clip, UnknownClipError, decode
 from server.core.bounded_cache import BoundedCache
@@ -49,6 +50,34 @@ MOST_CLIPS: Final = 4_096
 def is_upload(name: str) -> bool:
     """Whether a clip's name is one of an uploaded clip."""
     return _NAME.fullmatch(name) is not None
+
+
+@dataclass(frozen=True)
+class ClipLabel:
+    """What is stored beside the sound of a clip."""
+
+    title: str
+    duration_s: float
+
+    @classmethod
+    def parse(cls, data: bytes) -> Self:
+        """Raises ValueError."""
+        try:
+            label = json.loads(data)
+            title, duration_s = str(label["title"]), float(label["duration_s"])
+        except (KeyError, TypeError) as exc:
+            raise ValueError(f"no label of a clip: {exc}") from exc
+        if not math.isfinite(duration_s):
+            raise ValueError(f"no clip lasts {duration_s} s")
+        return cls(title, duration_s)
+
+    def serialize(self) -> bytes:
+        return json.dumps({"title": self.title, "duration_s": self.duration_s}).encode()
+
+    def describe(self, name: str, *, expires_s: float) -> Clip:
+        """The clip that has this label."""
+        expires_at = datetime.fromtimestamp(expires_s, UTC).isoformat(timespec="seconds")
+        return Clip(name, self.title, self.duration_s, "", expires_at=expires_at)
 
 
 @dataclass(frozen=True)
@@ -108,6 +137,13 @@ def storing() -> Iterator[None]:
         raise RequestError("storage_failed", f"the clip could not be stored: {what}", status=507) from exc
 
 
+def no_room(size_bytes: int, free_bytes: int) -> RequestError:
+    """The refusal of a clip that does not fit into the quota."""
+    free = max(0, free_bytes)
+    problem = f"the clip takes {size_bytes} bytes when decoded, and {free} are free: delete others first"
+    return RequestError("clips_full", problem, status=507)
+
+
 class ClipStore:
     """The uploaded clips in `folder`, which is made if it does not exist: at most `quota_bytes` of them, each for
     `expires_s` since it was uploaded last. Safe to use from any thread. Raises OSError if the folder cannot be used."""
@@ -143,27 +179,56 @@ class ClipStore:
             if name in entries:
                 os.utime(self._label(name), (now_s, now_s))
                 return self.describe(name), False
-            label = json.dumps({"title": title, "duration_s": duration_s}).encode()
+            label = ClipLabel(title, duration_s).serialize()
             size_bytes = incoming.target.stat().st_size + len(label)
             stored_bytes = sum(entry.size_bytes for entry in entries.values())
             if stored_bytes + size_bytes > self._quota_bytes or len(entries) >= MOST_CLIPS:
-                free = max(0, self._quota_bytes - stored_bytes)
-                problem = f"the clip takes {size_bytes} bytes when decoded, and {free} are free: delete others first"
-                raise RequestError("clips_full", problem, status=507)
-            incoming.target.replace(self._sound(name))
-            part = self._label(name).with_suffix(_PART)
-            try:
-                with part.open("wb") as file:
-                    file.write(label)
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.utime(part, (now_s, now_s))
-                part.replace(self._label(name))
-            except OSError:
-                for path in (part, self._sound(name)):
-                    path.unlink(missing_ok=True)
-                raise
+                raise no_room(size_bytes, self._quota_bytes - stored_bytes)
+            self._put(name, incoming, label, now_s)
         return self.describe(name), True
+
+    def keep_copy(self, name: str, incoming: Incoming, label: ClipLabel, uploaded_s: float) -> None:
+        """Store the decoded sound of a clip that has its place elsewhere. If the quota has no room, clips that were
+        uploaded longest ago go. Raises RequestError storage_failed."""
+        with storing(), self._locked():
+            self._clean_up()
+            data = label.serialize()
+            room_bytes = self._quota_bytes - incoming.target.stat().st_size - len(data)
+            others = sorted(self._entries().values(), key=lambda entry: entry.uploaded_s)
+            stored_bytes = sum(entry.size_bytes for entry in others)
+            for number, entry in enumerate(others):
+                if stored_bytes <= room_bytes and len(others) - number < MOST_CLIPS:
+                    break
+                self._unlink(entry.name)
+                stored_bytes -= entry.size_bytes
+            self._put(name, incoming, data, uploaded_s)
+
+    def renew(self, name: str, uploaded_s: float) -> bool:
+        """Let a clip expire as one that was uploaded then. Returns False if it is not here."""
+        try:
+            self._sound(name).stat()
+            if self._label(name).stat().st_mtime != uploaded_s:
+                os.utime(self._label(name), (uploaded_s, uploaded_s))
+            self.describe(name)
+        except (OSError, UnknownClipError):
+            return False
+        return True
+
+    def _put(self, name: str, incoming: Incoming, label: bytes, uploaded_s: float) -> None:
+        """Move the sound to its place, and write the label."""
+        incoming.target.replace(self._sound(name))
+        part = self._label(name).with_suffix(_PART)
+        try:
+            with part.open("wb") as file:
+                file.write(label)
+                file.flush()
+                os.fsync(file.fileno())
+            os.utime(part, (uploaded_s, uploaded_s))
+            part.replace(self._label(name))
+        except OSError:
+            for path in (part, self._sound(name)):
+                path.unlink(missing_ok=True)
+            raise
 
     def clips(self) -> list[Clip]:
         """Descriptions of all clips that have not expired, by name."""
@@ -177,14 +242,12 @@ class ClipStore:
         """Raises UnknownClipError."""
         try:
             uploaded_s = self._label(name).stat().st_mtime
-            label = json.loads(self._label(name).read_bytes())
-            title, duration_s = str(label["title"]), float(label["duration_s"])
-        except (OSError, ValueError, KeyError, TypeError):
+            label = ClipLabel.parse(self._label(name).read_bytes())
+        except (OSError, ValueError):
             raise UnknownClipError(name) from None
         if uploaded_s + self._expires_s <= self._time_s():
             raise UnknownClipError(name)
-        expires = datetime.fromtimestamp(uploaded_s + self._expires_s, UTC)
-        return Clip(name, title, duration_s, "", expires_at=expires.isoformat(timespec="seconds"))
+        return label.describe(name, expires_s=uploaded_s + self._expires_s)
 
     def file(self, name: str) -> Path:
         """The file of a clip. Raises UnknownClipError."""

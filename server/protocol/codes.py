@@ -32,6 +32,7 @@ ERROR_CODES: Final[Mapping[str, str]] = {
     "unknown_level": "the scene has no quality level of this name",
     "unknown_effect": "no effect has this name; the message lists them",
     "unknown_clip": "there is no such clip; GET /v1/clips lists them",
+    "store_unreachable": "the store of uploaded clips does not answer, or refuses; ask later",
     "undecodable_clip": "the clip's file cannot be read; the message says why",
     "malformed_message": "the message is not JSON, or a field is missing, unknown or has an impossible value",
     "malformed_pose": "the position or the direction is impossible",
