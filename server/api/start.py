@@ -2,10 +2,9 @@
 
 import contextlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
-from fastapi import FastAPI
-
-from server.api.app import create_app
 from server.api.catalogue import load_hrtfs, load_scenes
 from server.api.first_start import CompilingProcess
 from server.api.process_peers import ProcessPeers
@@ -14,16 +13,22 @@ from server.core.errors import NafirError
 from server.runtime.drain import Drain
 from server.scene.bundle import Bundle, bundled_scenes
 
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
 
 @contextlib.contextmanager
 def loaded_app(
     settings: Settings, drain: Drain, *, peers: ProcessPeers | None = None
-) -> Iterator[tuple[FastAPI, tuple[str, ...]]]:
+) -> Iterator[tuple["FastAPI", tuple[str, ...]]]:
     """The application with its scenes, and their names. Raises NafirError if there is none, or if something cannot be
     loaded."""
     with CompilingProcess() as compiler:
         compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
-        scenes = load_scenes(settings.bundles, keys=settings.read_bundle_keys())
+        with ThreadPoolExecutor(1, "nafir-scenes") as loading:
+            loaded = loading.submit(load_scenes, settings.bundles, keys=settings.read_bundle_keys())
+            from server.api.app import create_app  # meanwhile: it takes as long as ways round a level's edges
+        scenes = loaded.result()
         if not scenes:
             raise NafirError("there is no scene to serve: give one with --bundle FOLDER")
         hrtfs = load_hrtfs(settings.hrtfs, scenes)

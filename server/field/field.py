@@ -387,8 +387,12 @@ class AcousticField:
         codec = self.graph.parameters.codec
         # Bins between DC and Nyquist count twice, for negative frequencies.
         weight = np.r_[1, np.full(codec.bins - 2, 2), 1] / codec.n_fft * codec.hop / codec.window_energy
-        magnitude = codec.magnitude(self.graph.spectrograms(listeners, emitters, heads).log_magnitude)
-        return np.asarray(np.einsum("bcft,f->bc", magnitude[..., : self.level.frames] ** 2, weight))
+        log_magnitude = self.graph.predictions(listeners, emitters, heads).log_magnitude
+        axis = self.graph.parameters.frame_axis
+        if axis is not None:  # coherence has no part in it, and would take as long to spread as the ears' levels
+            log_magnitude = log_magnitude @ axis.spread()
+        magnitude = codec.magnitude(log_magnitude[..., : self.level.frames])
+        return np.asarray(np.einsum("bcft,bcft,f->bc", magnitude, magnitude, weight, optimize=True))
 
     def onset_s(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(B,) time at which the first sound can arrive, around corners if necessary."""

@@ -18,6 +18,7 @@ def levels(bundle, tmp_path_factory) -> FieldsByLevel:
     return FieldsByLevel.load(write_bundle(tmp_path_factory.mktemp("dear") / "scene", manifest, files))
 
 
+@pytest.mark.timed
 def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
     measured = measure_levels(levels, rounds=3, poses=5)
     assert [level["name"] for level in measured["levels"]] == ["standard", "dear"]
@@ -29,6 +30,7 @@ def test_the_dear_level_costs_more_and_it_is_decoding_that_costs(levels):
     assert measured["summary"][0]["value"] == standard["ms_p50"]
 
 
+@pytest.mark.timed
 def test_calibration_tells_them_apart_too(levels, filters):
     costs_ms = calibrate(levels, filters)
     assert costs_ms["dear"] > 2 * costs_ms["standard"]

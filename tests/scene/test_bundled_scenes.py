@@ -11,10 +11,11 @@ from server.api.app import create_app
 from server.api.catalogue import load_scenes
 from server.api.settings import Settings
 from server.responses.loudness import MAX_POINTS, usual_spacing_m
-from server.scene.bundle import bundled_scenes
+from server.scene.bundle import Bundle, bundled_scenes
 from tests.api.test_routes import wait_until_ready
 
 SCENES = [folder.name for folder in bundled_scenes()]
+WITH_FIELDS = [folder.name for folder in bundled_scenes() if Bundle.load(folder).manifest.fields]
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +37,12 @@ def needed(operation: dict, scene: dict) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("scene", "chosen"),
     [
-        # The apartment's map is of a thousand places, which take seconds.
+        # Maps of scenes with a field are of a thousand places, which take seconds.
         *(
-            pytest.param(scene, {"loudness": {"spacing_m": "1"}} if scene == "apartment" else {}, id=scene)
+            pytest.param(scene, {"loudness": {"spacing_m": "1"}} if scene in WITH_FIELDS else {}, id=scene)
             for scene in SCENES
         ),
-        pytest.param("apartment", {}, id="apartment, all of its map", marks=pytest.mark.long),
+        *(pytest.param(scene, {}, id=f"{scene}, all of its map", marks=pytest.mark.long) for scene in WITH_FIELDS),
     ],
 )
 def test_every_route_of_the_scene_answers_at_its_defaults(client, scene, chosen):
