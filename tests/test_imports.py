@@ -36,10 +36,15 @@ def modules(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.py"))
 
 
+WITH_RAY = ("server.cluster.deployment", "server.cluster.routing")
+"""The one says that it needs Ray, the other runs in Ray alone."""
+
+
 def test_every_server_module_imports_without_torch_and_training() -> None:
     names = [module_name(path) for path in modules(SERVER)]
     if importlib.util.find_spec("ray") is None:
-        names.remove("server.cluster.deployment")  # which says that it needs Ray
+        for name in WITH_RAY:
+            names.remove(name)
     assert "server.core.errors" in names
     result = subprocess.run(
         [sys.executable, "-W", "error::ImportWarning", "-c", IMPORT_ALL_WITHOUT_TRAINING, *names],
