@@ -127,7 +127,8 @@ class LevelPredictions(Predictions):
             changes_jnd[state] = pairs.without_transmission_jnd(losses_db)
         masses = [material.surface_mass_kg_m2 for material in self.scene.place.materials.values()]
         known = [mass for mass in masses if mass]
-        reason = f"walls and doors of {min(known):g} to {max(known):g} kg/m2, beside what comes round them"
+        ends = dict.fromkeys(f"{mass:g}" for mass in (min(known), max(known)))
+        reason = f"walls and doors of {' to '.join(ends)} kg/m2, beside what comes round them"
         direct = _told(changes_jnd, f"{reason}; the direct sound")
         return max(
             direct,

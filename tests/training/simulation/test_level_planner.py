@@ -126,7 +126,9 @@ def test_only_what_is_light_lets_anything_heard_through(box):
     changes_jnd = []
     for mass in (1.0, 30.0, 1000.0):
         level = level_of(rooms, surface_mass_kg_m2=mass)
-        changes_jnd.append(LevelPredictions(level, level.probe_positions(0)).transmission().change_jnd)
+        told = LevelPredictions(level, level.probe_positions(0)).transmission()
+        assert f"walls and doors of {mass:g} kg/m2" in told.reason
+        changes_jnd.append(told.change_jnd)
     assert changes_jnd == sorted(changes_jnd, reverse=True)
     assert changes_jnd[0] > 4 * THRESHOLD.enter_jnd
     assert changes_jnd[-1] < THRESHOLD.enter_jnd
