@@ -54,7 +54,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test test-untimed lint format bundle scenes table tables office own-scenes predictions container-test clean hard-cases fuzz
+.PHONY: help serve test test-untimed lint format bundle scenes table tables office own-scenes meshes predictions container-test clean hard-cases fuzz
 .PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor audit deploy-check
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
@@ -137,6 +137,10 @@ mutants: $(VENV)/installed-dev ## remove each guard in a copy of the tree and sh
 
 container-test: ## build the container image and try it read-only (needs buildah, podman and runc)
 	tests/integration/container.sh
+
+meshes: $(VENV)/installed-training ## whether simulation in meshes is right, beside plans, pyroomacoustics and laws, to docs/results/meshes.md: five to ten minutes
+	$(BIN)/python -m benchmarks.meshes
+	$(BIN)/python -m benchmarks.pages
 
 predictions: $(VENV)/installed-training ## what plans predict of effects beside what simulation finds, in ten rooms of extremes: some minutes
 	$(BIN)/python -m training.trials.rooms_tried
