@@ -7,6 +7,7 @@ middle of a stream, and some clients stop reading.
 """
 
 import asyncio
+import contextlib
 import json
 import struct
 from collections import Counter
@@ -46,7 +47,7 @@ _ACTIONS_PER_S = 60.0
 _LIFE_S = 2.0, 20.0
 _STALL_S = 3.0
 _PATIENCE_S = 15.0
-_REFUSAL_S = 3.0
+_REFUSAL_S = 8.0
 _MOST_EMITTERS = 8
 _BINARY_POSE = struct.Struct("<BBHI7f")
 _CLIPS = "man-reading", "trumpet", "woman-reading"
@@ -134,7 +135,7 @@ class _Life:
         self._serial = self._pose_id = self._dry_sequence = 0
         self._errors = self._faults = 0
         self._newest = 0
-        self._pong = asyncio.Event()
+        self._pong, self._refused = asyncio.Event(), asyncio.Event()
 
     async def listen(self) -> None:
         client = self._client
@@ -149,7 +150,9 @@ class _Life:
                     await self._socket.send(Acknowledge(sequence=block.sequence).serialize())
                 continue
             event = parse_server_message(message)
-            self._errors += isinstance(event, Error)
+            if isinstance(event, Error):
+                self._errors += 1
+                self._refused.set()
             if isinstance(event, Pong):
                 self._pong.set()
 
@@ -173,8 +176,11 @@ class _Life:
         thread may come after the answer to a ping, since a ping does not pass through that thread."""
         await self._socket.send(Ping(id=1).serialize())
         await asyncio.wait_for(self._pong.wait(), _PATIENCE_S)
-        if self._errors < self._faults:
-            await asyncio.sleep(_REFUSAL_S)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_REFUSAL_S):
+                while self._errors < self._faults:
+                    self._refused.clear()
+                    await self._refused.wait()
         self._client.faults_unanswered += max(0, self._faults - self._errors)
 
     # Valid actions. Each returns the messages to send.
