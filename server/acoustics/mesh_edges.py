@@ -16,6 +16,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -117,10 +118,12 @@ class StillEdges:
         self._of_leaves = [_edges(leaf).longest(_MOST_LEAF_EDGES) for leaf in leaves]
         self._spots = _spots(tree, _edges(tree.mesh), _SPACING_M)
         self._steps = _steps(tree, self._spots)
-        self._lengths, self._before = _shortest(self._steps)
+        with ThreadPoolExecutor(1) as beside:
+            shortest = beside.submit(_shortest, self._steps)
+            self._cells = _cells(tree, self._spots.lifted, self._steps)
+            self._near = [_cells_in_sight(tree, self._cells, points) for points in swept]
+        self._lengths, self._before = shortest.result()
         self._order = np.argsort(self._lengths, axis=-1, kind="stable").astype(np.int16)
-        self._cells = _cells(tree, self._spots.lifted, self._steps)
-        self._near = [_cells_in_sight(tree, self._cells, points) for points in swept]
 
     def bends_among(
         self, tree: MeshTree, leaves: Sequence[TriangleMesh], moves: Sequence[Callable[[_Floats], _Floats]]

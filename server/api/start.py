@@ -27,7 +27,9 @@ def loaded_app(
         compiler.begin(map(Bundle.load, bundled_scenes()), cores=usable_cores())
         with ThreadPoolExecutor(1, "nafir-scenes") as loading:
             loaded = loading.submit(load_scenes, settings.bundles, keys=settings.read_bundle_keys())
-            from server.api.app import create_app  # meanwhile: it takes as long as ways round a level's edges
+            # Meanwhile: importing these takes as long as finding the ways round the edges of a level.
+            import server.api.serving  # noqa: F401
+            from server.api.app import create_app
         scenes = loaded.result()
         if not scenes:
             raise NafirError("there is no scene to serve: give one with --bundle FOLDER")

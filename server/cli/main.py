@@ -120,10 +120,6 @@ def serve(
         url = url_of(listeners[0], settings.host)
         if settings.processes > 1:
             _serve_in_processes(settings, given, listeners, url)
-        import uvicorn
-        from rich.console import Console
-
-        from server.api import serving
         from server.api.start import loaded_app
         from server.runtime.drain import Drain
         from server.runtime.memory import give_back_large_arrays
@@ -131,6 +127,11 @@ def serve(
         give_back_large_arrays()
         drain = Drain(settings.drain_s)
         application, scenes = opened.enter_context(loaded_app(settings, drain))
+        import uvicorn
+        from rich.console import Console
+
+        from server.api import serving
+
         announcement = serving.announcement(scenes, url)
         config = uvicorn.Config(application, **serving.uvicorn_options(settings))
         on_start = lambda: Console().print(announcement, highlight=False)  # noqa: E731
