@@ -12,9 +12,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.record import FOLDER, UNKNOWN, Cell, Column, Host, Result, Table, Value
+from benchmarks.record import FOLDER, Cell, Column, Host, Result, Table, Value
 from server.bench.history import current_commit
-from server.bench.machine import describe_machine
 
 PAPER_PSNR_DB: Final = {(75, "nerf"): "25.41", (75, "nerf-naf"): "26.19"}
 PAPER_GAIN_DB: Final = {(75, "nerf-naf"): "+0.78", (150, "nerf-naf"): "+0.05"}
@@ -117,15 +116,7 @@ def main() -> None:
     run, command, *others = sys.argv[1:]
     commit = others[:1]
     measured = json.loads((Path(run) / "results.json").read_text(encoding="utf-8"))
-    if len(others) > 1:
-        host = Host.model_validate_json(Path(others[1]).read_text(encoding="utf-8"))
-    else:
-        machine = describe_machine()
-        host = Host(
-            processor=str(machine["processor"]),
-            instruction_set=str(machine["instruction_set"]),
-            cores=machine["cores"] or UNKNOWN,
-        )
+    host = Host.model_validate_json(Path(others[1]).read_text(encoding="utf-8")) if len(others) > 1 else Host.this()
     png = (Path(run) / "views.png").read_bytes()
     result = result_of(measured, png, host=host, command=command, commit=commit[0] if commit else current_commit())
     (FOLDER / "cross-modal.json").write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")

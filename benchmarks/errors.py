@@ -12,9 +12,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.record import FOLDER, UNKNOWN, Cell, Column, Host, Result, Table, Value
+from benchmarks.record import FOLDER, Cell, Column, Host, Result, Table, Value
 from server.bench.history import current_commit
-from server.bench.machine import describe_machine
 
 METRICS: Final = ("t60", "edt", "c50", "drr", "iacc", "spectral_loss", "level", "itd", "onset")
 _FLOOR: Final = "floor"
@@ -70,13 +69,7 @@ def main() -> None:
     parser.add_argument("--training", required=True, help="how the data were simulated and the field was trained")
     parser.add_argument("--note", default="", help="what else is to be known of the machine")
     given = parser.parse_args()
-    machine = describe_machine()
-    host = Host(
-        processor=str(machine["processor"]),
-        instruction_set=str(machine["instruction_set"]),
-        cores=machine["cores"] or UNKNOWN,
-        note=given.note,
-    )
+    host = Host.this(given.note)
     evaluation = json.loads(given.evaluation.read_text(encoding="utf-8"))
     facts = {"Data": given.data, "Training": given.training}
     result = result_of(evaluation, host=host, command=given.command, commit=current_commit(), facts=facts)

@@ -20,10 +20,9 @@ from typing import Final, TypeVar
 import numpy as np
 from rich.console import Console
 
-from benchmarks.record import FOLDER, UNKNOWN, Cell, Column, Host, Result, Table, Value
+from benchmarks.record import FOLDER, Cell, Column, Host, Result, Table, Value
 from server.acoustics.metrics import PARAMETER_METRICS
 from server.bench.history import current_commit
-from server.bench.machine import describe_machine
 from server.scene.geometry import Geometry
 from server.scene.mesh_geometry import MeshGeometry
 from training.trials import mesh_laws, plans_as_meshes
@@ -363,13 +362,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sizes = Sizes()
     console = Console(stderr=True)
     measured = measure(sizes, console.print)
-    machine = describe_machine()
-    host = Host(
-        processor=str(machine["processor"]),
-        instruction_set=str(machine["instruction_set"]),
-        cores=machine["cores"] or UNKNOWN,
-        note=given.note,
-    )
+    host = Host.this(given.note)
     minutes = (time.monotonic() - began_s) / 60
     command = f"`make meshes` (`python -m benchmarks.meshes`): {minutes:.1f} minutes"
     result = result_of(measured, sizes, host=host, commit=current_commit(), command=command)

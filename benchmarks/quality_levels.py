@@ -12,9 +12,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.record import FOLDER, UNKNOWN, Cell, Column, Host, Result, Table, Value
+from benchmarks.record import FOLDER, Cell, Column, Host, Result, Table, Value
 from server.bench.history import current_commit
-from server.bench.machine import describe_machine
 
 PATH: Final = FOLDER / "quality-levels.json"
 _COLUMNS: Final = (
@@ -87,13 +86,7 @@ def main() -> None:
     parser.add_argument("--fields", required=True, help="how the fields were trained")
     parser.add_argument("--note", default="", help="what else is to be known of the machine")
     given = parser.parse_args()
-    machine = describe_machine()
-    host = Host(
-        processor=str(machine["processor"]),
-        instruction_set=str(machine["instruction_set"]),
-        cores=machine["cores"] or UNKNOWN,
-        note=given.note,
-    )
+    host = Host.this(given.note)
     frontier = json.loads(given.frontier.read_text(encoding="utf-8"))
     facts = {"Data": given.data, "Fields": given.fields}
     result = result_of(frontier, host=host, command=given.command, commit=current_commit(), facts=facts)

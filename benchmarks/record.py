@@ -12,6 +12,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from server.bench.machine import describe_machine
+
 FOLDER = Path(__file__).with_name("results")
 Unknown = Literal["unknown"]
 UNKNOWN: Unknown = "unknown"
@@ -39,6 +41,17 @@ class Host(_Form):
     instruction_set: str
     cores: int | Unknown
     note: str = ""
+
+    @classmethod
+    def this(cls, note: str = "") -> Self:
+        """This machine."""
+        machine = describe_machine()
+        return cls(
+            processor=str(machine["processor"]),
+            instruction_set=str(machine["instruction_set"]),
+            cores=machine["cores"] or UNKNOWN,
+            note=note,
+        )
 
     def __str__(self) -> str:
         known = [self.processor, self.instruction_set, *([] if self.cores == UNKNOWN else [_cores(self.cores)])]
