@@ -32,7 +32,9 @@ def answer(name, tmp_path):
         case "sound":
             return Response(b"0" * 10_000, media_type="audio/wav", headers=TAGGED)
         case "coded":
-            return Response(gzip.compress(b"0" * 10_000), headers={"Content-Encoding": "gzip"}, media_type="text/css")
+            return Response(
+                gzip.compress(b"0" * 10_000, mtime=0), headers={"Content-Encoding": "gzip"}, media_type="text/css"
+            )
         case "file":
             (tmp_path / "a.js").write_text("// a comment\n" * 10_000)
             return FileResponse(tmp_path / "a.js")
