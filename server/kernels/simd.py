@@ -207,10 +207,10 @@ def prefetch(_context: Any, _address: Any) -> Any:
 
 @intrinsic
 def load_int(_context: Any, _address: Any, _index: Any) -> Any:
-    """Load one int64; `index` counts int64."""
+    """Load one int64 at an address that is a multiple of four; `index` counts int64."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        return builder.load(_pointer(builder, *args, _INT64, 8), align=8)
+        return builder.load(_pointer(builder, *args, _INT64, 8), align=4)
 
     return types.int64(types.int64, types.int64), generate
 

@@ -19,10 +19,11 @@ Spectra = npt.NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class SpectralFilter:
-    """An impulse response (IR) transformed for every stage: one array (channel, partition, bin) per stage.
-    Immutable."""
+    """An impulse response (IR) transformed for every stage: one array (channel, partition, bin) per stage, and the sum
+    of squares of the stage's samples. Immutable."""
 
     spectra: tuple[Spectra, ...]
+    energies: tuple[float, ...]
 
 
 class AnySizeConvolver:
@@ -51,16 +52,18 @@ class AnySizeConvolver:
         self._shared_gain = {number: np.zeros((2, sources), np.float32) for number in shared}
 
     def prepare(self, ir: FloatArray, like: SpectralFilter | None = None, same_from: int = 0) -> SpectralFilter:
-        spectra = []
+        spectra, energies = [], []
         for number, stage in enumerate(self._partitioning.stages):
             if like is not None and stage.start >= same_from:
                 spectra.append(like.spectra[number])
+                energies.append(like.energies[number])
                 continue
             piece = ir[:, stage.start : stage.end]
             count = -(-piece.shape[1] // stage.size)
             padded = np.pad(piece, ((0, 0), (0, count * stage.size - piece.shape[1])))
             spectra.append(scipy.fft.rfft(padded.reshape(len(ir), count, stage.size), 2 * stage.size))
-        return SpectralFilter(tuple(spectra))
+            energies.append(float(np.einsum("cn,cn->", piece, piece)))
+        return SpectralFilter(tuple(spectra), tuple(energies))
 
     def want(self, source: int, filters: SpectralFilter) -> None:
         self._wanted[source] = filters

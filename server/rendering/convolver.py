@@ -15,11 +15,11 @@ Compiled code (`server.rendering.convolver_kernel`) convolves blocks of a power 
 (`server.rendering.any_size_convolver`) all others; their results agree to -120 dB.
 """
 
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -148,25 +148,13 @@ class Convolver:
         if like is not None and like.layout != self._layout:
             raise ValueError("the IR that it is like was prepared for another convolver")
         samples = _single(ir)
-        energies = self._energies_of(samples, like, same_from)
+        prepared = self._engine.prepare(samples, None if like is None else like.filters, same_from)
+        energies = tuple(accumulate(reversed(prepared.energies)))[::-1]
         # Energy says it at once of nearly all; neither is true of what is no number.
         # guard: a response is sound
         if not (energies[0] <= LOUDEST or -LOUDEST <= ir.min() <= ir.max() <= LOUDEST):
             raise ValueError(f"impulse response has samples that are not finite, or beyond {LOUDEST:g}")
-        prepared = self._engine.prepare(samples, None if like is None else like.filters, same_from)
         return PartitionedIr(self._layout, prepared, energies)
-
-    def _energies_of(self, samples: FloatArray, like: PartitionedIr | None, same_from: int) -> tuple[float, ...]:
-        """The energies from the start of each stage on, of which `like` has those of the stages that are reused."""
-        starts = self._starts
-        own = len(starts) if like is None else bisect_left(starts, same_from)
-        energies = [] if like is None else list(like.energies[own:])
-        after = energies[0] if energies else 0.0
-        ends = [*starts, samples.shape[1]]
-        for number in reversed(range(own)):
-            after += _energy(samples[:, starts[number] : ends[number + 1]])
-            energies.insert(0, after)
-        return tuple(energies)
 
     @property
     def preparation(self) -> Hashable:
@@ -305,11 +293,6 @@ def _single(samples: npt.NDArray[np.floating]) -> FloatArray:
         return samples  # as most are; setting and resetting the error state would take longer than the rest
     with np.errstate(over="ignore"):
         return samples.astype(np.float32)
-
-
-def _energy(samples: FloatArray) -> float:
-    """The energy of samples (channel, n): their sum of squares, computed without a copy."""
-    return float(np.einsum("cn,cn->", samples, samples))
 
 
 # Importing either engine takes a third of a second, and most processes need only one of them.

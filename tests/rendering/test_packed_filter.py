@@ -30,6 +30,23 @@ def test_zeros_at_the_end_are_no_difference(ir):
         assert long[: len(short)] == short
 
 
+def test_rows_of_an_odd_length_are_no_difference(ir):
+    """The second row then begins at no multiple of eight bytes."""
+    odd = np.ascontiguousarray(ir[:, :-1])
+    ir[:, -1] = 0
+    assert digests(odd) == digests(ir)
+
+
+@pytest.mark.parametrize("samples", [1, 511, 512, SAMPLES - 1, 8000])
+def test_energies_are_sums_of_squares_of_the_samples_of_each_stage(rng, samples):
+    ir = rng.standard_normal((2, samples)).astype(np.float32)
+    expected = [np.sum(ir[:, stage.start : stage.end].astype(np.float64) ** 2) for stage in PARTITIONING.stages]
+    packed = pack(ir, PARTITIONING)
+    np.testing.assert_allclose(packed.energies, expected, rtol=1e-12)
+    early = pack(0.5 * ir[:, :512], PARTITIONING, packed, 512)
+    np.testing.assert_allclose(early.energies, [0.25 * expected[0], *expected[1:]], rtol=1e-12)
+
+
 @pytest.mark.parametrize("at", [0, 63, 64, 511, 512, 4000, SAMPLES - 1])
 def test_one_sample_is_a_difference_in_its_partition_alone(ir, at):
     other = ir.copy()
