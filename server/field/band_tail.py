@@ -23,7 +23,7 @@ from server.field.directional_response_kernel import Buffers, Early, Tail, respo
 from server.field.directions_kernel import TURNED_SCRATCH
 from server.field.graph import Spectrograms
 from server.kernels.cache_lines import zeros_on_lines
-from server.kernels.simd import LANES
+from server.kernels.simd import WIDE_LANES
 from server.scene.manifest import CodecParameters
 
 Float32 = npt.NDArray[np.float32]
@@ -58,7 +58,7 @@ class BandTail:
         centres = (edges[:-1] + edges[1:] - 1) / 2
         # The fade lies before the first late column, so begin with the column before it.
         first = max(0, int(np.searchsorted(edges, self.early_frames)) - 2)
-        self._early_columns = min(len(centres), int(np.searchsorted(edges, self.early_frames)) + 1)
+        self._early_columns = _columns_of(parameters, self.early_frames)
         places = centres[first:] * codec.hop - codec.frame_lead_samples + codec.n_fft / 2
         missing = _missing(codec.window * codec.dual_window, codec.hop)
         noises, diffuse = _band_noises(graph, frozen_noise)
@@ -123,7 +123,7 @@ class BandTail:
         codec, bands = self._codec, len(self.parts.diffuse)
         columns = self._graph.parameters.columns
         ears = zeros_on_lines(2, 1, 2, codec.bins, columns)
-        row = -(-self._early_columns // LANES) * LANES
+        row = -(-self._early_columns // WIDE_LANES) * WIDE_LANES
         turning = self._graph.turning.level
         return Buffers(
             turned=zeros_on_lines(turning.size + TURNED_SCRATCH),
@@ -166,6 +166,14 @@ class BandTail:
                 scratch,
                 responses[row],
             )
+
+
+def _columns_of(parameters: CodecParameters, frames: int) -> int:
+    """The number of columns of a prediction from which its first `frames` are made."""
+    if parameters.frame_axis is None:
+        return frames
+    weights = parameters.frame_axis.spread()[:, :frames]
+    return int(np.flatnonzero(weights.any(axis=1))[-1]) + 1
 
 
 def _missing(product: Floats, hop: int) -> Float32:

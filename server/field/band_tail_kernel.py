@@ -8,8 +8,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.decoding_kernel import silence
 from server.kernels.compiled import compiled
-from server.kernels.simd import LANES, add, broadcast, load, load_shorts, multiply_add, store
+from server.kernels.simd import WIDE_LANES, add, lanes, multiply_add, store
 
 Float32 = npt.NDArray[np.float32]
 Int16 = npt.NDArray[np.int16]
@@ -17,8 +18,11 @@ Int16 = npt.NDArray[np.int16]
 MOST_IN_A_BAND = 0.999
 """The greatest coherence of the ears in a band."""
 _ALMOST = np.float32(MOST_IN_A_BAND)
-_AT_ONCE = 1024
-_RAMP = np.arange(LANES, dtype=np.float32)
+_LINES = 6
+"""Numbers that describe the gains of a band between two columns."""
+_RAMP = np.arange(WIDE_LANES, dtype=np.float32)
+_wide = lanes(WIDE_LANES)
+load, load_shorts, load_broadcast, broadcast = _wide.load, _wide.load_shorts, _wide.load_broadcast, _wide.broadcast
 
 
 @compiled
@@ -113,27 +117,35 @@ def add_band_tail(
     The tail fades in from sample `fade_at` on, where the first frame begins that was not decoded. `missing` (2, sample)
     is the amplitude that decoded sound lacks from there on: without the frames after that one, and without that one
     too. If the response is delayed by part of a frame, a `share` of that frame is in it, and the tail is between both
-    rows. After `missing`, no sound was decoded, so the response must be silent there. `scratch` (2, sample) is
-    overwritten.
+    rows. After `missing`, from `decoded_until` on, no sound was decoded: what the response contains there is
+    overwritten. `scratch` (2, sample) is overwritten, too.
     """
-    end = min(response.shape[1], noises.shape[2])
+    size = response.shape[1]
+    end = min(size, noises.shape[2])
     there, one = np.float32(share), np.float32(1.0)
-    begin, whole = max(0, fade_at), min(end, max(0, fade_at + missing.shape[1]))
+    lines = np.empty((noises.shape[0], _LINES), np.float32)
+    decoded = decoded_until(fade_at, missing, size)
+    begin, whole = max(0, fade_at), min(end, decoded)
     if begin < whole:
-        for ear in range(2):
-            for n in range(whole - begin):
-                scratch[ear, n] = 0
-        _add(gains, places, noises, begin, whole, begin, scratch)
+        _write(gains, places, noises, begin, whole, begin, lines, scratch)
         for ear in range(2):
             for n in range(begin, whole):
                 amplitude = there * missing[0, n - fade_at] + (one - there) * missing[1, n - fade_at]
                 response[ear, n] += amplitude * scratch[ear, n - begin]
-    _add(gains, places, noises, whole, end, 0, response)
+    _write(gains, places, noises, whole, end, 0, lines, response)
+    silence(response, max(end, decoded), size)
 
 
 @compiled
-def _add(gains, places, noises, begin, end, offset, out) -> None:
-    """Add samples `begin` to `end` to `out`, whose first sample is number `offset`."""
+def decoded_until(fade_at: int, missing: Float32, size: int) -> int:
+    """The number of samples of a response of `size` in which there is decoded sound, as `add_band_tail` has it."""
+    return min(size, max(0, fade_at + missing.shape[1]))
+
+
+@compiled
+def _write(gains, places, noises, begin, end, offset, lines, out) -> None:
+    """Write samples `begin` to `end` to `out`, whose first sample is number `offset`. Between two places every gain is
+    a line over the samples: `lines` (band, 6) are its three values at the first sample and their slopes."""
     last = places.size - 1
     at = begin
     column = -1
@@ -141,42 +153,48 @@ def _add(gains, places, noises, begin, end, offset, out) -> None:
         while column < last and places[column + 1] <= at:
             column += 1
         stop = end if column == last else min(end, math.ceil(places[column + 1]))
-        stop = min(stop, at + _AT_ONCE)
         low, high = max(column, 0), min(column + 1, last)
         apart = places[high] - places[low]
         share = (at - places[low]) / apart if apart > 0 else 0.0
         step = 1.0 / apart if apart > 0 else 0.0
         for band in range(noises.shape[0]):
-            _add_band(gains[:, band, low], gains[:, band, high], share, step, noises[band], at, stop, at - offset, out)
+            for part in range(3):
+                before, after = gains[part, band, low], gains[part, band, high]
+                lines[band, part] = before + (after - before) * share
+                lines[band, 3 + part] = (after - before) * step
+        _write_lines(lines, noises, at, stop, at - offset, out)
         at = stop
 
 
 @compiled
-def _add_band(before, after, share, step, noise, at, stop, to, out) -> None:
-    """Add one band's samples `at` to `stop`, to `out` from its sample `to` on."""
-    left, left_step = _line(before[0], after[0], share, step)
-    other, other_step = _line(before[1], after[1], share, step)
-    own, own_step = _line(before[2], after[2], share, step)
-    at_left, at_right = noise[0].ctypes.data + 2 * at, noise[1].ctypes.data + 2 * at
+def _write_lines(lines, noises, at, stop, to, out) -> None:
+    """Write the sum of all bands' samples `at` to `stop` along `lines` to `out`, from its sample `to` on. Sums stay in
+    registers."""
+    left_noise, right_noise = noises.ctypes.data + 2 * at, noises[0, 1].ctypes.data + 2 * at
+    by_band = noises.strides[0]
     to_left, to_right = out[0].ctypes.data + 4 * to, out[1].ctypes.data + 4 * to
+    values, ramp, nothing = lines.ctypes.data, load(_RAMP.ctypes.data, 0), broadcast(np.float32(0.0))
     count = stop - at
-    vectors = count // LANES * LANES
-    lefts, others, owns = broadcast(left), broadcast(other), broadcast(own)
-    left_steps, other_steps, own_steps = broadcast(left_step), broadcast(other_step), broadcast(own_step)
-    for n in range(0, vectors, LANES):
-        x = add(load(_RAMP.ctypes.data, 0), broadcast(np.float32(n)))
-        of_left, of_right = load_shorts(at_left, n), load_shorts(at_right, n)
-        store(to_left, n, multiply_add(multiply_add(x, left_steps, lefts), of_left, load(to_left, n)))
-        right = multiply_add(multiply_add(x, other_steps, others), of_left, load(to_right, n))
-        store(to_right, n, multiply_add(multiply_add(x, own_steps, owns), of_right, right))
+    vectors = count // WIDE_LANES * WIDE_LANES
+    for n in range(0, vectors, WIDE_LANES):
+        x = add(ramp, broadcast(np.float32(n)))
+        left, right = nothing, nothing
+        for band in range(noises.shape[0]):
+            line = _LINES * band
+            of_left = load_shorts(left_noise + band * by_band, n)
+            of_right = load_shorts(right_noise + band * by_band, n)
+            gain = multiply_add(x, load_broadcast(values, line + 3), load_broadcast(values, line))
+            other = multiply_add(x, load_broadcast(values, line + 4), load_broadcast(values, line + 1))
+            own = multiply_add(x, load_broadcast(values, line + 5), load_broadcast(values, line + 2))
+            left = multiply_add(gain, of_left, left)
+            right = multiply_add(own, of_right, multiply_add(other, of_left, right))
+        store(to_left, n, left)
+        store(to_right, n, right)
     for n in range(vectors, count):
         x = np.float32(n)
-        of_one, of_other = np.float32(noise[0, at + n]), np.float32(noise[1, at + n])
-        out[0, to + n] += (left + left_step * x) * of_one
-        out[1, to + n] += (other + other_step * x) * of_one + (own + own_step * x) * of_other
-
-
-@compiled
-def _line(before, after, share, step):
-    """The value and the slope per sample of a gain, at a `share` of the way from `before` to `after`."""
-    return np.float32(before + (after - before) * share), np.float32((after - before) * step)
+        out[0, to + n] = out[1, to + n] = 0
+        for band in range(noises.shape[0]):
+            of_left, of_right = np.float32(noises[band, 0, at + n]), np.float32(noises[band, 1, at + n])
+            out[0, to + n] += (lines[band, 0] + lines[band, 3] * x) * of_left
+            other, own = lines[band, 1] + lines[band, 4] * x, lines[band, 2] + lines[band, 5] * x
+            out[1, to + n] += other * of_left + own * of_right

@@ -23,7 +23,7 @@ from server.acoustics.spherical_harmonics import harmonic_count, sampled
 from server.field.directions_kernel import TURNED_SCRATCH, Turning, ears_of_directions, turn_products
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
 from server.field.runtime import InferenceSession
-from server.kernels.simd import LANES
+from server.kernels.simd import WIDE_LANES
 from server.rendering.ear_products import PRODUCTS, EarProducts
 from server.rendering.hrtf import HeadFilters, kemar
 from server.scene.bundle import Bundle
@@ -122,10 +122,7 @@ class DirectionalGraph(FieldGraph):
         rows, all_columns = len(orientations), arrivals.log_magnitude.shape[-1]
         levels, coherence = np.empty((2, rows, 2, codec.bins, all_columns), np.float32)
         written = all_columns if columns is None else columns
-        # What is left out must be numbers: decoders multiply it by zero.
-        levels[..., written:] = 0
-        coherence[..., written:] = 0
-        whole = -(-written // LANES) * LANES
+        whole = -(-written // WIDE_LANES) * WIDE_LANES
         harmonics = harmonic_count(self.heard_order)
         work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self.between_bands
@@ -146,6 +143,9 @@ class DirectionalGraph(FieldGraph):
                 levels[row],
                 coherence[row],
             )
+        # What is left out must be numbers: decoders multiply it by zero.
+        levels[..., written:] = 0
+        coherence[..., written:] = 0
         no_phase = np.zeros((rows, 2, codec.bins, self.parameters.known_frames), np.float32)
         return Spectrograms(levels, no_phase, no_phase, coherence)
 

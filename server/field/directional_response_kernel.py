@@ -12,7 +12,7 @@ import numpy.typing as npt
 from server.acoustics.columns_kernel import Columns
 from server.acoustics.decoding_kernel import WHOLE, Shape, Workspace, decode
 from server.acoustics.stft_kernel import Windows
-from server.field.band_tail_kernel import add_band_tail, find_band_gains
+from server.field.band_tail_kernel import add_band_tail, decoded_until, find_band_gains
 from server.field.directions_kernel import PRODUCTS, Turning, ears_of_directions, turn_products
 from server.kernels.compiled import compiled
 
@@ -98,6 +98,10 @@ def respond(
             buffers.levels[0],
             buffers.coherence[0],
         )
+        delay = aligned[row] / hop
+        whole = math.floor(delay)
+        fade_at = (whole + shape.used) * hop - shape.frame_lead
+        until = decoded_until(fade_at, tail.missing, responses.shape[2])
         decode(
             buffers.levels,
             buffers.no_phase,
@@ -110,7 +114,7 @@ def respond(
             early.noise,
             WHOLE,
             decoding,
-            responses[row : row + 1],
+            responses[row : row + 1, :, :until],
         )
         find_band_gains(
             log_magnitude[row],
@@ -123,9 +127,6 @@ def respond(
             least,
             buffers.gains,
         )
-        delay = aligned[row] / hop
-        whole = math.floor(delay)
-        fade_at = (whole + shape.used) * hop - shape.frame_lead
         places = tail.places + aligned[row]
         add_band_tail(
             buffers.gains, places, tail.noises, fade_at, delay - whole, tail.missing, buffers.scratch, responses[row]

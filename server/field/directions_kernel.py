@@ -13,12 +13,14 @@ from server.acoustics.spherical_harmonics import harmonics_after_first
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
     LANES,
+    WIDE_LANES,
     add,
     at_least,
     broadcast,
     choose_below,
     divide,
     exponential,
+    lanes,
     load,
     load_broadcast,
     logarithm,
@@ -32,6 +34,8 @@ from server.kernels.simd import (
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
+_wide = lanes(WIDE_LANES)
+_load_wide, _all_wide, _wide_of = _wide.load, _wide.load_broadcast, _wide.broadcast
 _SILENT = np.float32(-80.0)
 """A log magnitude below every floor."""
 
@@ -121,32 +125,33 @@ def ears_of_directions(
     `log_magnitude` (band, column) and `directions` (k - 1, band, column) are a field's predictions, `products` (bin,
     product, k) those of the turned head. A bin lies between `band` (bin,) and the next, at this `share` (bin,) of the
     way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. Only the
-    first `columns` are written. `work` is (k + 1, band, columns in whole vectors).
+    first `columns` are written and, where there is room, silence up to a whole vector. `work` is (k + 1, band, columns
+    in whole vectors of WIDE_LANES).
     """
     harmonics = products.shape[2]
-    floor, lowest = broadcast(np.float32(log_floor)), broadcast(np.float32(least))
-    zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
+    floor, lowest = _wide_of(np.float32(log_floor)), _wide_of(np.float32(least))
+    zero, one = _wide_of(np.float32(0.0)), _wide_of(np.float32(1.0))
     _find_powers(log_magnitude, directions, columns, floor, zero, work)
     row, rest = work.shape[2], work[harmonics].ctypes.data
     by_band, by_harmonic = 4 * row, 4 * row * work.shape[1]
     for bin_ in range(products.shape[0]):
-        upper = broadcast(share[bin_])
+        upper = _wide_of(share[bin_])
         lower = subtract(one, upper)
         of_bin = products[bin_].ctypes.data
-        for column in range(0, columns, LANES):
+        for column in range(0, columns, WIDE_LANES):
             at = work.ctypes.data + band[bin_] * by_band
-            power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
-            left, right = multiply(load_broadcast(of_bin, 0), power), multiply(load_broadcast(of_bin, harmonics), power)
-            real = multiply(load_broadcast(of_bin, 2 * harmonics), power)
-            imaginary = multiply(load_broadcast(of_bin, 3 * harmonics), power)
+            power = multiply_add(upper, _load_wide(at + by_band, column), multiply(lower, _load_wide(at, column)))
+            left, right = multiply(_all_wide(of_bin, 0), power), multiply(_all_wide(of_bin, harmonics), power)
+            real = multiply(_all_wide(of_bin, 2 * harmonics), power)
+            imaginary = multiply(_all_wide(of_bin, 3 * harmonics), power)
             least_left, least_right = multiply(lowest, left), multiply(lowest, right)
             for k in range(1, harmonics):
                 at += by_harmonic
-                power = multiply_add(upper, load(at + by_band, column), multiply(lower, load(at, column)))
-                left = multiply_add(load_broadcast(of_bin, k), power, left)
-                right = multiply_add(load_broadcast(of_bin, harmonics + k), power, right)
-                real = multiply_add(load_broadcast(of_bin, 2 * harmonics + k), power, real)
-                imaginary = multiply_add(load_broadcast(of_bin, 3 * harmonics + k), power, imaginary)
+                power = multiply_add(upper, _load_wide(at + by_band, column), multiply(lower, _load_wide(at, column)))
+                left = multiply_add(_all_wide(of_bin, k), power, left)
+                right = multiply_add(_all_wide(of_bin, harmonics + k), power, right)
+                real = multiply_add(_all_wide(of_bin, 2 * harmonics + k), power, real)
+                imaginary = multiply_add(_all_wide(of_bin, 3 * harmonics + k), power, imaginary)
             # guard: where directions cancel, sound is left over
             left_power = at_least(left, least_left)
             left_size, right_size = square_root(left_power), square_root(at_least(right, least_right))
@@ -157,7 +162,7 @@ def ears_of_directions(
             square = multiply_add(real, real, multiply(imaginary, imaginary))
             # guard: coherence from directions is at most one
             shrunk = divide(one, square_root(at_least(square, one)))
-            if column + LANES <= columns:
+            if column + WIDE_LANES <= levels.shape[2]:
                 store(levels[0, bin_].ctypes.data, column, logarithm(add(left_size, floor)))
                 store(levels[1, bin_].ctypes.data, column, logarithm(add(right_size, floor)))
                 store(coherence[0, bin_].ctypes.data, column, multiply(real, shrunk))
@@ -185,8 +190,8 @@ def _find_powers(log_magnitude, directions, columns, floor, zero, work) -> None:
             power[column] = log_magnitude[number, column]
         for column in range(columns, whole):
             power[column] = _SILENT
-        for column in range(0, whole, LANES):
-            magnitude = at_least(subtract(exponential(load(power.ctypes.data, column)), floor), zero)
+        for column in range(0, whole, WIDE_LANES):
+            magnitude = at_least(subtract(exponential(_load_wide(power.ctypes.data, column)), floor), zero)
             store(power.ctypes.data, column, multiply(magnitude, magnitude))
         for k in range(1, directions.shape[0] + 1):
             for column in range(columns):

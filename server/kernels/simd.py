@@ -102,6 +102,8 @@ class Lanes(NamedTuple):
 
     load: Any
     """`load(address, index)`: the floats from `index` on."""
+    load_shorts: Any
+    """`load_shorts(address, index)`: int16 from `index` on, as floats; `index` counts int16."""
     load_broadcast: Any
     """`load_broadcast(address, index)`: the float at `index` in every lane."""
     broadcast: Any
@@ -122,6 +124,15 @@ def lanes(count: int) -> Lanes:
     def load(_context: Any, _address: Any, _index: Any) -> Any:
         def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
             return _load(builder, *args, count)
+
+        return vector(types.int64, types.int64), generate
+
+    @intrinsic
+    def load_shorts(_context: Any, _address: Any, _index: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            shorts = ir.VectorType(ir.IntType(16), count)
+            values = builder.load(_pointer(builder, *args, shorts, 2), align=2)
+            return builder.sitofp(values, _floats(count))
 
         return vector(types.int64, types.int64), generate
 
@@ -156,13 +167,17 @@ def lanes(count: int) -> Lanes:
 
         return vector(types.int64, types.int64), generate
 
-    return Lanes(load, load_broadcast, broadcast, load_twice, load_opposed)
+    return Lanes(load, load_shorts, load_broadcast, broadcast, load_twice, load_opposed)
 
 
 LANES = 8
 """The number of lanes in most loops."""
 _usual = lanes(LANES)
-load, load_broadcast, broadcast = _usual.load, _usual.load_broadcast, _usual.broadcast
+load, load_shorts, load_broadcast, broadcast = _usual[:4]
+
+WIDE_LANES: Final = 16 if HAS_WIDE_REGISTERS else LANES
+"""The number of lanes of one register, for loops in which no lane depends on another. Where there are 32 registers of
+eight lanes, or of four, more lanes would not help."""
 
 
 # Other functions that read memory.
@@ -176,18 +191,6 @@ def pointer(_context: Any, _address: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
 
     return types.voidptr(types.int64), generate
-
-
-@intrinsic
-def load_shorts(_context: Any, _address: Any, _index: Any) -> Any:
-    """Load LANES int16 as floats; `index` counts int16."""
-
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        shorts = ir.VectorType(ir.IntType(16), LANES)
-        values = builder.load(_pointer(builder, *args, shorts, 2), align=2)
-        return builder.sitofp(values, _floats(LANES))
-
-    return Vector(LANES)(types.int64, types.int64), generate
 
 
 @intrinsic

@@ -9,6 +9,7 @@ from server.acoustics.geometry import Quaternion
 from server.acoustics.sound_path import PlanPathFinder
 from server.acoustics.spherical_harmonics import real_harmonics
 from server.field.band_tail import early_frames
+from server.field.band_tail_kernel import add_band_tail
 from server.field.directional_graph import DirectionalGraph
 from server.field.field import AcousticField
 from server.health.double_precision import DoubleFullResponse
@@ -161,3 +162,29 @@ def test_first_samples_are_those_of_the_whole_response(samples):
         np.testing.assert_allclose(first, whole[:, :samples], rtol=1e-5, atol=1e-8)
         with pytest.raises(ValueError, match="finite"):
             field.first_samples([(np.nan, 0.0, 0.0)], [EMITTER], [0.3], samples)
+
+
+@pytest.mark.parametrize("fade_at", [-400, -100, 37, 500, 900, 1200])
+@pytest.mark.parametrize("noise_samples", [700, 1000, 1300])
+def test_from_where_nothing_was_decoded_there_is_the_tail_alone(fade_at, noise_samples):
+    rng = np.random.default_rng(0)
+    size, share, missing = 1000, 0.25, rng.random((2, 80), np.float32)
+    noises = rng.integers(-1000, 1000, (7, 2, noise_samples)).astype(np.int16)
+    gains, places = rng.random((3, 7, 5), np.float32), np.array([-20.5, 80.0, 208.25, 460.0, 461.5])
+    decoded = rng.standard_normal((2, size)).astype(np.float32)
+    found = decoded.copy()
+    add_band_tail(gains, places, noises, fade_at, share, missing, np.full((2, 80), np.nan, np.float32), found)
+    count, samples = min(size, noise_samples), np.arange(min(size, noise_samples))
+    left, other, own = (
+        np.stack([np.interp(samples, places, of_band) for of_band in of_part]) for of_part in gains.astype(float)
+    )
+    one, two = noises[:, 0, :count], noises[:, 1, :count]
+    tail = np.zeros((2, size))
+    tail[:, :count] = np.sum(left * one, axis=0), np.sum(other * one + own * two, axis=0)
+    until = min(size, max(0, fade_at + 80))
+    amplitude = np.ones(size)
+    amplitude[: max(0, fade_at)] = 0
+    fading = np.arange(max(0, fade_at), until)
+    amplitude[fading] = share * missing[0, fading - fade_at] + (1 - share) * missing[1, fading - fade_at]
+    decoded[:, until:] = 0
+    assert_allclose(found, decoded + amplitude * tail, rtol=0, atol=1e-3)

@@ -238,18 +238,23 @@ def test_load_int_reads_sixty_four_bits():
     values = np.array([0, -1, 2**63 - 1, -(2**63), 2**31])
     assert [read(values, index) for index in range(values.size)] == values.tolist()
     assert read(values[2:], -1) == -1
+    after_four_bytes = np.frombuffer(b"\0" * 4 + values.tobytes() + b"\0" * 4, np.int64)
+    assert read(after_four_bytes.view(np.int32)[1:], 2) == 2**63 - 1
 
 
-def test_load_shorts_reads_integers_of_sixteen_bits_as_floats():
+@EACH
+def test_load_shorts_reads_integers_of_sixteen_bits_as_floats(lanes):
+    load_shorts = simd.lanes(lanes).load_shorts
+
     @numba.njit
     def read(values, index, found):
-        simd.store(found.ctypes.data, 0, simd.load_shorts(values.ctypes.data, index))
+        simd.store(found.ctypes.data, 0, load_shorts(values.ctypes.data, index))
 
-    values = np.array([0, -1, 2**15 - 1, -(2**15), 256, -256, 77, 3, 5], np.int16)
-    found = np.zeros(8, np.float32)
+    values = np.resize(np.array([0, -1, 2**15 - 1, -(2**15), 256, -256, 77, 3, 5], np.int16), lanes + 1)
+    found = np.zeros(lanes, np.float32)
     for index in (0, 1):
         read(values, index, found)
-        assert found.tolist() == values[index : index + 8].tolist()
+        assert found.tolist() == values[index : index + lanes].tolist()
 
 
 def test_load_short_int_reads_thirty_two_bits_with_their_sign():
