@@ -19,9 +19,10 @@ from server.acoustics.geometry import LEVEL
 from server.field.band_tail_kernel import add_band_tail, find_band_gains
 from server.field.decoder import Decoder
 from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
-from server.field.directional_response_kernel import Buffers, Early, Tail, respond
+from server.field.directional_response_kernel import Buffers, Early, Hearing, Room, Tail, respond
 from server.field.directions_kernel import TURNED_SCRATCH
 from server.field.graph import Spectrograms
+from server.kernels.by_reference import Reference
 from server.kernels.cache_lines import zeros_on_lines
 from server.kernels.simd import WIDE_LANES
 from server.scene.manifest import CodecParameters
@@ -68,7 +69,8 @@ class BandTail:
         # As 16-bit integers, half as much has to be read, which is most of the work.
         rounded = np.round(noises / steps).astype(np.int16)
         self.parts = Tail(first, diffuse, np.ascontiguousarray(steps[..., 0], np.float32), rounded, places, missing)
-        self._buffers: list[Buffers] = []
+        self._hearings: dict[Decoder, Reference] = {}
+        self._rooms: list[Reference] = []
 
     @property
     def nbytes(self) -> int:
@@ -91,28 +93,18 @@ class BandTail:
             responses = decoder.decode(self._early(arrivals, orientations), aligned)
             self._add(arrivals, orientations, aligned, responses)
             return np.ascontiguousarray(responses[..., :samples])
-        graph = self._graph
-        band, share = graph.between_bands
+        hearing = self._hearings.get(decoder)
+        if hearing is None:
+            band, share = self._graph.between_bands
+            early = Early(band, share, self._early_columns, *constants)
+            hearing = self._hearings[decoder] = Reference(Hearing(self._graph.turning, early, self.parts, LEAST_POWER))
         try:
-            buffers = self._buffers.pop()
+            room = self._rooms.pop()
         except IndexError:
-            buffers = self._new_buffers()
-        with decoder.workspace() as workspace:
-            responses = decoder.room(len(aligned), samples)
-            respond(
-                arrivals.log_magnitude,
-                arrivals.directions,
-                orientations,
-                aligned,
-                graph.turning,
-                Early(band, share, self._early_columns, *constants),
-                self.parts,
-                LEAST_POWER,
-                buffers,
-                workspace,
-                responses,
-            )
-        self._buffers.append(buffers)
+            room = Reference(Room(self._new_buffers(), decoder.new_workspace()))
+        responses = decoder.room(len(aligned), samples)
+        respond(arrivals.log_magnitude, arrivals.directions, orientations, aligned, hearing, room, responses)
+        self._rooms.append(room)
         return responses
 
     def _early(self, arrivals: Arrivals, orientations: Floats) -> Spectrograms:

@@ -5,6 +5,7 @@ Axes: B poses; spectrograms (B, ear, frequency, frame); responses (B, ear, sampl
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -90,7 +91,7 @@ class Decoder:
         if self._any_size is not None:
             return self._any_size.decode(predicted, aligned, near)
         responses = self.room(len(aligned))
-        with self.workspace() as work:
+        with self._workspace() as work:
             if self._phase.kind == "griffin_lim":
                 for row, response in enumerate(near):
                     self._iterate(predicted[row : row + 1], aligned[row : row + 1], response, work, responses[row])
@@ -98,7 +99,7 @@ class Decoder:
                 self._run(predicted, aligned, WHOLE, work, responses)
         return responses
 
-    @property
+    @cached_property
     def constants(self) -> tuple[Columns, Shape, Windows, Float32] | None:
         """What compiled code needs to decode spectrograms as this does; None if NumPy decodes them."""
         if self._any_size is not None:
@@ -109,13 +110,17 @@ class Decoder:
         """Room for so many responses or, with `samples`, for so much of them; not initialised."""
         return _POOL.floats(count, 2, self.ir_samples if samples is None else samples)
 
+    def new_workspace(self) -> Workspace:
+        """Buffers of compiled code for one call at a time."""
+        return Workspace.of(self._shape, self._codec.n_fft, iterates=self._phase.kind == "griffin_lim")
+
     @contextmanager
-    def workspace(self) -> Iterator[Workspace]:
+    def _workspace(self) -> Iterator[Workspace]:
         """Lend buffers of compiled code."""
         try:
             work = self._workspaces.pop()
         except IndexError:
-            work = Workspace.of(self._shape, self._codec.n_fft, iterates=self._phase.kind == "griffin_lim")
+            work = self.new_workspace()
         yield work
         self._workspaces.append(work)
 

@@ -14,6 +14,7 @@ from server.acoustics.decoding_kernel import WHOLE, Shape, Workspace, decode
 from server.acoustics.stft_kernel import Windows
 from server.field.band_tail_kernel import add_band_tail, decoded_until, find_band_gains
 from server.field.directions_kernel import PRODUCTS, Turning, ears_of_directions, turn_products
+from server.kernels.by_reference import Reference, value_of
 from server.kernels.compiled import compiled
 
 Float32 = npt.NDArray[np.float32]
@@ -59,23 +60,37 @@ class Buffers(NamedTuple):
     scratch: Float32
 
 
+class Hearing(NamedTuple):
+    """What is the same for all responses through one head; `least` is as in `server.field.directions_kernel`."""
+
+    turning: Turning
+    early: Early
+    tail: Tail
+    least: float
+
+
+class Room(NamedTuple):
+    """Where one call of `respond` at a time may work."""
+
+    buffers: Buffers
+    decoding: Workspace
+
+
 @compiled
 def respond(
     log_magnitude: Float32,
     directions: Float32,
     orientations: Floats,
     aligned: Floats,
-    turning: Turning,
-    early: Early,
-    tail: Tail,
-    least: float,
-    buffers: Buffers,
-    decoding: Workspace,
+    hearing: Reference,
+    room: Reference,
     responses: Float32,
 ) -> None:
     """Write responses to poses with these predictions, (B, band, column) and (B, k - 1, band, column), and heads with
-    these `orientations` (B, 4). The first coded sample lies at sample `aligned` (B,). Where directions cancel, an ear's
-    power is `least` times the diffuse one."""
+    these `orientations` (B, 4). The first coded sample lies at sample `aligned` (B,). `hearing` and `room` refer to
+    those."""
+    turning, early, tail, least = value_of(hearing)
+    buffers, decoding = value_of(room)
     shape, hop = early.shape, early.windows.n_fft // 4
     harmonics = turning.level.shape[1]
     rows = turning.level.shape[0] // PRODUCTS

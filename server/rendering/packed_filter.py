@@ -1,10 +1,10 @@
 """Impulse responses (IRs) in the memory layout of the compiled convolver."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
-from itertools import accumulate
-from typing import Any
+from functools import lru_cache
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +12,9 @@ from numba import carray
 
 from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
-from server.kernels.compiled import compiled, compiled_loosely
+from server.kernels.compiled import compiled
 from server.kernels.copying import copy
+from server.kernels.energy import energy_of
 from server.kernels.simd import load_int, pointer
 from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
@@ -23,6 +24,9 @@ DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 _PER_STAGE = 3
+_PER_PLAN = 6
+_PLANS = 64
+"""How many plans are kept: responses have few lengths, unless their ends are silent."""
 _SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
 _STEP = np.uint64(0xC4CEB9FE1A85EC53)
 _SHIFT = np.uint64(32)
@@ -64,50 +68,72 @@ def pack(
     # one memory layout, because numba compiles for each layout separately
     if ir.dtype != np.float32 or not ir.flags.carray:  # asking first takes a tenth of the time
         ir = np.require(ir, np.float32, ["C", "A", "W"])
-    channels, samples = ir.shape
-    all_stages = partitioning.stages
     # Reused stages come last.
-    stages = all_stages if like is None else tuple(stage for stage in all_stages if stage.start < same_from)
-    counts = [max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size))) for stage in stages]
-    lengths = [2 * stage.size * count * channels for stage, count in zip(stages, counts, strict=True)]
-    room = _POOL.floats(sum(lengths))  # every value is written below
-    numbers = np.zeros(_PER_STAGE * len(all_stages) + sum(counts), np.int64)
-    header, digests = numbers[: _PER_STAGE * len(all_stages)], numbers[_PER_STAGE * len(all_stages) :]
-    energies = np.zeros(len(stages))
-    table, _ = _stage_tables(partitioning)
-    _pack(ir, table[: len(stages)], room, header, digests, energies)
-    made = PackedFilter(header, _parts(room, lengths), _parts(digests, counts), tuple(energies.tolist()))
+    made = len(partitioning.stages) if like is None else sum(stage.start < same_from for stage in partitioning.stages)
+    plan = _plan_of(partitioning, *ir.shape, made)
+    spectra = _POOL.floats(plan.floats)  # every value is written below
+    numbers, energies = np.zeros(plan.numbers, np.int64), np.zeros(made)
+    header = numbers[plan.header]
+    _pack(ir, plan.stages, spectra, header, numbers[plan.header.stop :], energies)
+    of_stages = PackedFilter(
+        header,
+        tuple([spectra[part] for part in plan.spectra]),
+        tuple([numbers[part] for part in plan.digests]),
+        tuple(energies.tolist()),
+    )
     if like is None:
-        return made
-    reused = len(stages)
-    header[_PER_STAGE * reused :] = like.header[_PER_STAGE * reused :]
+        return of_stages
+    header[_PER_STAGE * made :] = like.header[_PER_STAGE * made :]
     return PackedFilter(
         header,
-        made.spectra + like.spectra[reused:],
-        made.digests + like.digests[reused:],
-        made.energies + like.energies[reused:],
+        of_stages.spectra + like.spectra[made:],
+        of_stages.digests + like.digests[made:],
+        of_stages.energies + like.energies[made:],
     )
 
 
-def _parts(values: Any, lengths: Sequence[int]) -> tuple[Any, ...]:
-    """Views of parts (lengths,) of an array, one after the other."""
-    ends = accumulate(lengths)
-    return tuple(values[end - length : end] for end, length in zip(ends, lengths, strict=True))
+class _Plan(NamedTuple):
+    """Where the parts of a filter are: each stage's spectra among so many `floats`, and the header and each stage's
+    digests among so many `numbers`. `stages` (stage, 6) are the start of each stage, the number and size of its
+    partitions, and the addresses of its transform's tables; `tables` keep these alive."""
+
+    floats: int
+    numbers: int
+    header: slice
+    spectra: tuple[slice, ...]
+    digests: tuple[slice, ...]
+    stages: IntArray
+    tables: tuple[odd_fft.Tables, ...]
 
 
-@cache
-def _stage_tables(partitioning: Partitioning) -> tuple[IntArray, tuple[odd_fft.Tables, ...]]:
-    """(stage, 6) the start of each stage, the number and size of its partitions, and the addresses of its transform's
-    tables; also these tables, to keep them alive."""
-    all_tables = tuple(odd_fft.tables(stage.size) for stage in partitioning.stages)
+@lru_cache(_PLANS)
+def _plan_of(partitioning: Partitioning, channels: int, samples: int, made: int) -> _Plan:
+    """The plan for the first `made` stages of a response (channels, samples)."""
+    stages = partitioning.stages[:made]
+    counts = [max(0, min(stage.partitions, -(-(samples - stage.start) // stage.size))) for stage in stages]
+    spectra = _parts(2 * stage.size * count * channels for stage, count in zip(stages, counts, strict=True))
+    header = slice(0, _PER_STAGE * len(partitioning.stages))
+    digests = _parts(counts, header.stop)
+    tables = tuple(odd_fft.tables(stage.size) for stage in stages)
     rows = [
-        (
-            *(stage.start, stage.partitions, stage.size),
-            *(address(tables.twist), address(tables.passes), address(tables.lanes)),
-        )
-        for stage, tables in zip(partitioning.stages, all_tables, strict=True)
+        (stage.start, count, stage.size, address(of.twist), address(of.passes), address(of.lanes))
+        for stage, count, of in zip(stages, counts, tables, strict=True)
     ]
-    return np.array(rows, np.int64), all_tables
+    return _Plan(
+        spectra[-1].stop if spectra else 0,
+        digests[-1].stop if digests else header.stop,
+        header,
+        spectra,
+        digests,
+        np.array(rows, np.int64).reshape(made, _PER_PLAN),
+        tables,
+    )
+
+
+def _parts(lengths: Iterable[int], start: int = 0) -> tuple[slice, ...]:
+    """Slices of these lengths from `start` on, one after the other."""
+    ends = accumulate(lengths, initial=start)
+    return tuple(slice(begin, end) for begin, end in pairwise(ends))
 
 
 @compiled
@@ -123,9 +149,8 @@ def _pack(
     padded = room[3]
     done, to = 0, spectra.ctypes.data
     for number in range(len(stages)):
-        start, most, size = stages[number, 0], stages[number, 1], stages[number, 2]
+        start, count, size = stages[number, 0], stages[number, 1], stages[number, 2]
         twist, passes, lanes = stages[number, 3], stages[number, 4], stages[number, 5]
-        count = max(0, min(most, (samples - start + size - 1) // size))
         header[_PER_STAGE * number] = to
         header[_PER_STAGE * number + 1] = count
         header[_PER_STAGE * number + 2] = digests.ctypes.data + digests.itemsize * done
@@ -140,7 +165,7 @@ def _pack(
                     padded[end - begin : size] = 0
                     first = padded.ctypes.data
                 digest = _digest(first, size, digest)
-                energies[number] += _energy(carray(pointer(first), (size,), np.float32))
+                energies[number] += energy_of(carray(pointer(first), (size,), np.float32))
                 at = filter_offset(channels, size // 8, count, 0, partition)
                 step = filter_offset(channels, size // 8, count, 1, partition) - at
                 odd_fft.forward(first, silence, bins, to + 4 * (at + 16 * channel), step, 8, size, twist, passes, lanes)
@@ -171,12 +196,3 @@ def _digest(samples: int, size: int, seed: Any) -> Any:
 def _mixed(digest: Any, word: int) -> Any:
     digest = (digest ^ np.uint64(word)) * _FACTOR
     return digest ^ (digest >> _SHIFT)
-
-
-@compiled_loosely
-def _energy(samples: Any) -> float:
-    """The sum of squares."""
-    energy = np.float64(0.0)
-    for n in range(len(samples)):
-        energy += np.float64(samples[n]) * np.float64(samples[n])
-    return energy

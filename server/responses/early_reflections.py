@@ -101,15 +101,15 @@ class EarlyReflections:
         """For each emitter the n paths that `add` adds: lengths (n,), arrivals (n, 3), and gains (n, band) in dB
         without distance and air."""
         found = self._finder.find(listener.position, [emitter.pose.position for emitter in emitters])
-        gains_db = found.gain_db
-        for path, number in enumerate(found.emitter):
-            emitter = emitters[number]
-            if emitter.directivity != OMNIDIRECTIONAL:
-                played_db = amplitude_to_db(reverberation_gain(emitter.directivity))
-                gains_db[path] += departure_gain_db(emitter, found.departure[path]) - played_db
-        starts = np.searchsorted(found.emitter, np.arange(len(emitters) + 1))
+        starts = _starts(found.emitter, len(emitters))
         parts = [slice(start, stop) for start, stop in itertools.pairwise(starts)]
-        return [(found.length_m[part], found.arrival[part], gains_db[part]) for part in parts]
+        for emitter, part in zip(emitters, parts, strict=True):
+            if emitter.directivity == OMNIDIRECTIONAL:
+                continue
+            played_db = amplitude_to_db(reverberation_gain(emitter.directivity))
+            for gain_db, departure in zip(found.gain_db[part], found.departure[part], strict=True):
+                gain_db += departure_gain_db(emitter, departure) - played_db
+        return [(found.length_m[part], found.arrival[part], found.gain_db[part]) for part in parts]
 
     def band_power(self, listeners: _Floats, emitter: npt.ArrayLike) -> _Floats:
         """Return the squared pressure (B, band) of the reflections at `listeners` (B, 3) from one omnidirectional
@@ -122,3 +122,12 @@ class EarlyReflections:
         spread = np.maximum(found.length_m, NEAR_LIMIT_M)[:, None] ** 2
         np.add.at(power, found.emitter, db_to_power(levels_db) / spread)
         return power
+
+
+def _starts(emitter: npt.NDArray[np.int64], count: int) -> Sequence[int]:
+    """(count + 1,) the number of the first path of each emitter, and that of all paths. `emitter` is that of each path,
+    in ascending order."""
+    if count == 1:  # as most often, and a search takes as long as finding the paths
+        return (0, len(emitter))
+    starts: list[int] = np.searchsorted(emitter, np.arange(count + 1)).tolist()
+    return starts

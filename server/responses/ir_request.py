@@ -158,9 +158,9 @@ def _held(
     shape = len(emitters), field.channels, field.ir_samples if samples is None else samples
     if not late:
         return np.zeros(shape, np.float32)
-    ears = np.tile(np.asarray(listener.position), (len(late), 1))
+    ears = np.array([listener.position] * len(late))
     places = np.array([emitters[row].pose.position for row in late])
-    heads = np.tile(np.asarray(listener.orientation), (len(late), 1))
+    heads = np.array([listener.orientation] * len(late))
     if samples is None:
         answer = field.impulse_responses(ears, places, heads, remember=remember)
     else:

@@ -8,7 +8,7 @@ import pytest
 from numba.core.errors import TypingError
 from numpy.testing import assert_array_equal
 
-from server.kernels.by_reference import Reference, reference_at
+from server.kernels.by_reference import Reference, reference_at, value_of
 
 
 class Things(NamedTuple):
@@ -69,6 +69,52 @@ def test_reference_at_an_address_is_that_reference():
     assert turn_at(reference.address, like) == (-(2**62), 0.5, -2.0, 2)
     assert one.order.tolist() == [5, -7]
     assert other.order.tolist() == [23, -7]
+
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+
+class Nested(NamedTuple):
+    """A flag before other fields, tuples of one kind and of several, one in another."""
+
+    flag: bool
+    pair: Pair
+    of: Things
+    last: float
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_a_tuple_in_a_tuple_has_its_fields(flag):
+    @numba.njit
+    def read(nested):
+        turn_of = nested.of
+        turn_of.order[0] = nested.pair.second
+        return nested.flag, nested.pair.first, turn_of.count, turn_of.share, turn_of.table[0, 2], nested.last
+
+    own = Nested(flag, Pair(3, -4), things(share=0.5), 0.125)
+    assert read(Reference(own)) == (flag, 3, -(2**62), 0.5, 2.0, 0.125)
+    assert own.of.order.tolist() == [-4, -7]
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_the_value_of_a_reference_is_the_tuple_as_it_is_now(flag):
+    @numba.njit
+    def take(nested, times):
+        total = 0.0
+        for _ in range(times):
+            taken, pair, of, last = value_of(nested)
+            of.table[0, 0] += np.float32(1)
+            total += taken * pair.first + of.share + last
+        return total
+
+    own = Nested(flag, Pair(3, -4), things(share=0.5), 0.125)
+    reference = Reference(own)
+    assert take(reference, 1000) == 1000 * (3 * flag + 0.625)
+    assert own.of.table[0, 0] == 1000
+    with pytest.raises(TypingError):
+        take(own, 1)
 
 
 def test_a_field_that_is_not_there_does_not_compile():
