@@ -600,6 +600,10 @@ class Connection:
                 return _busy(admitted)
             place = admitted
         try:
+            if lost is None or lost.kept.place is None:
+                missed = await host.admission.take_turn(place, is_there=self._is_there)
+                if missed is not None:
+                    return _busy(missed)
             first_step = steps.index(place.step) if place.step in steps else 0
             with span("open stream", {"nafir.scene": hello.scene, "nafir.is_resumed": lost is not None}):
                 stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)

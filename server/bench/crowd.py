@@ -16,6 +16,7 @@ import struct
 import time
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,7 @@ _TURN_S = 12.0
 _GOLDEN = 0.618
 """Phase between the poses of successive walkers, as a share of the period. It spreads any number of them evenly."""
 _PATIENCE_S = 10.0
+_LOOK_EVERY_S = 0.005
 _SEQUENCE = struct.Struct("<4xI")
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
 _WHOLE, _MASKED = 0x80, 0x80
@@ -125,8 +127,10 @@ class Walker(asyncio.Protocol):
         self.is_lost = False
         self.retry_after_s: int | None = None
         """After how many seconds the server told it to come back; None if it was not refused in this way."""
+        self.asked_s = 0.0
+        """When it began to connect, by `time.monotonic`."""
         self.answered_s: float | None = None
-        """When the server let it in or refused it, by `time.monotonic`."""
+        """When the server let it in or refused it."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -269,6 +273,15 @@ class Walker(asyncio.Protocol):
             self.sounds.set_exception(ConnectionError(reason))
 
 
+class Rush(NamedTuple):
+    """Walkers that have asked at once. `stall_s` is the longest time for which none of them got to read, since they
+    share a thread, and `load` their CPU time divided by wall time."""
+
+    walkers: list[Walker]
+    stall_s: float
+    load: float
+
+
 class Crowd:
     """The walkers at the server on `port`. Each has `emitters` emitters at places of its own, which move as often as
     the walker with `sways`, and `listeners` listeners in its stream. With no poses all stand still."""
@@ -312,26 +325,34 @@ class Crowd:
                 walker.close()
         self.walkers = kept
         for number in range(len(self.walkers), count):
-            walker = await self._connect(number)
+            walker = await self._connect(number, self._choose_emitters())
             self.walkers.append(walker)
             await asyncio.wait_for(walker.sounds, _PATIENCE_S)
 
-    async def rush(self, count: int) -> list[Walker]:
-        """Have `count` walkers ask at once, and keep those that hear all their emitters. Returns all of them once each
+    async def rush(self, count: int) -> Rush:
+        """Have `count` walkers ask at once, and keep those that hear all their emitters. Returns once each of them
         hears or was refused, or after some seconds."""
+        # Half a millisecond an emitter: chosen one by one, they would keep the first who asks from hearing the answer.
+        chosen = [self._choose_emitters() for _ in range(count)]
 
         async def ask(number: int) -> Walker:
-            walker = await self._connect(number)
+            walker = await self._connect(number, chosen[number])
             with contextlib.suppress(ConnectionError, TimeoutError):
                 await asyncio.wait_for(asyncio.shield(walker.sounds), _PATIENCE_S)
             return walker
 
+        began_s, began_cpu_s = time.monotonic(), time.process_time()
+        watching = asyncio.create_task(_longest_stall_s(is_over := asyncio.Event()))
         walkers = await asyncio.gather(*(ask(number) for number in range(count)))
+        load = (time.process_time() - began_cpu_s) / (time.monotonic() - began_s)
+        is_over.set()
         self.walkers += [walker for walker in walkers if walker.hears_all]
-        return walkers
+        return Rush(walkers, await watching, load)
 
-    async def _connect(self, number: int) -> Walker:
-        emitters = self._places.emitters(self.emitters, self._rng)
+    def _choose_emitters(self) -> list[Circle]:
+        return self._places.emitters(self.emitters, self._rng)
+
+    async def _connect(self, number: int, emitters: Sequence[Circle]) -> Walker:
         pace = {"phase": number * _GOLDEN % 1, "poses_per_s": self.poses_per_s}
         make = partial(
             Walker,
@@ -342,8 +363,20 @@ class Crowd:
             block_size=self._block_size,
             listeners=self.listeners,
         )
+        asked_s = time.monotonic()
         _, walker = await asyncio.get_running_loop().create_connection(make, "127.0.0.1", self._port)
+        walker.asked_s = asked_s
         return walker
 
     async def close(self) -> None:
         await self.resize(0)
+
+
+async def _longest_stall_s(is_over: asyncio.Event) -> float:
+    """The longest time for which the event loop was kept from its work, until it `is_over`."""
+    longest_s = 0.0
+    while not is_over.is_set():
+        before_s = time.monotonic()
+        await asyncio.sleep(_LOOK_EVERY_S)
+        longest_s = max(longest_s, time.monotonic() - before_s - _LOOK_EVERY_S)
+    return longest_s

@@ -5,12 +5,15 @@ break somebody's sound is asked for three times as many streams in the same mome
 
 - `admitted`: streams that were let in and hear all their emitters. Of their blocks fewer than one in a thousand may be
   late, and none may step down to a cheaper quality.
-- `refused`: everybody else has to be told within a second when to come back. `answer_s` is the longest time from the
-  connection until a client was let in or refused.
+- `refused`: everybody else has to be told within a second when to come back. `answer_s` is the longest time from when a
+  client began to connect until it was let in or refused, `refusal_s` of those refused, `median_answer_s` the median.
+- `client_stall_s`: the longest time for which the clients, which share one thread, did not get to read: so much of
+  `answer_s` may be theirs. `client_load` is their CPU time meanwhile, divided by wall time.
 - `memory_growth`: memory of the server at the end, as a share of what it took when all had been answered, less one.
 """
 
 import asyncio
+import statistics
 import time
 import urllib.request
 from collections import Counter
@@ -19,7 +22,7 @@ from typing import Any
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from server.bench.crowd import Crowd
+from server.bench.crowd import Crowd, Walker
 from server.bench.machine import describe_machine
 from server.bench.places import Places
 from server.bench.scene import bundle_of
@@ -53,9 +56,8 @@ def measure_overload(
 
 async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> dict[str, Any]:
     try:
-        began_s = time.monotonic()
-        walkers = await crowd.rush(asked)
-        waits_s = [(walker.answered_s or time.monotonic()) - began_s for walker in walkers]
+        rush = await crowd.rush(asked)
+        walkers = rush.walkers
         refused = [walker for walker in walkers if walker.retry_after_s is not None and not walker.hears_all]
         await asyncio.sleep(_SETTLE_S)
         before = await asyncio.to_thread(ask, port, "begin")
@@ -69,11 +71,16 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
             "admitted": len(crowd.walkers),
             "refused": len(refused),
             "unanswered": asked - len(crowd.walkers) - len(refused),
-            "answer_s": max(waits_s),
+            "answer_s": max(map(_wait_s, walkers)),
+            "median_answer_s": statistics.median(map(_wait_s, walkers)),
+            "refusal_s": max(map(_wait_s, refused), default=None),
+            "client_stall_s": rush.stall_s,
+            "client_load": rush.load,
             "least_retry_s": min((walker.retry_after_s or 0 for walker in refused), default=None),
             "most_retry_s": max((walker.retry_after_s or 0 for walker in refused), default=None),
             "late_share": min(1.0, count_late(report) / due) if due else 1.0,
             "steps_down": told["nafir_level_steps_total", "load"],
+            "quality_at_end": report["quality_at_end"],
             "refused_for": {
                 reason: count for (name, reason), count in told.items() if name == "nafir_refusals_total" and count
             },
@@ -86,6 +93,11 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
         }
     finally:
         await crowd.close()
+
+
+def _wait_s(walker: Walker) -> float:
+    """How long a client waited for its answer, so far if it has none."""
+    return (walker.answered_s or time.monotonic()) - walker.asked_s
 
 
 def failures(measured: dict[str, Any]) -> list[str]:

@@ -52,6 +52,11 @@ class Workers:
         """Whether any work is being done or waits. Any thread may ask."""
         return bool(self._unfinished)
 
+    @property
+    def has_urgent(self) -> bool:
+        """Whether urgent work waits. Any thread may ask."""
+        return bool(self._urgent)
+
     def submit(self, work: Callable[..., T], /, *args: Any, kind: Kind, is_urgent: bool = False) -> Future[T]:
         """Queue `work(*args)`; the future has its result. If that is cancelled, the work is dropped at once. Takes no
         lock that a worker holds, since a worker of low priority may hold a lock for long."""

@@ -15,10 +15,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, Literal, get_args
 
 from server.core.errors import RequestError
 from server.streaming.audio_engine import AudioEngine, AudioThread
+from server.streaming.beginnings import Beginnings
 from server.streaming.headroom import (
     LIMITS,
     Correction,
@@ -114,11 +116,16 @@ class Place:
         return self.is_top if self.stream is None or self.is_asked else not self.stream.ladder.is_eased
 
 
+def _call_later(seconds: float, call: Callable[[], None]) -> None:
+    asyncio.get_running_loop().call_later(seconds, call)
+
+
 class Admission:
     """The places of a server whose streams `engine` renders on `cores`. If it is not `is_on`, only the number of
     streams is limited, to `most_streams`.
 
-    `time_s` is a clock, `loop_cpu_s` the CPU time of the calling thread, and `luck` a random number from 0 to 1.
+    `time_s` is a clock, `loop_cpu_s` the CPU time of the calling thread, `luck` a random number from 0 to 1, and
+    `call_later` runs a call on the event loop after some seconds.
     """
 
     def __init__(
@@ -133,6 +140,7 @@ class Admission:
         time_s: Callable[[], float] = time.monotonic,
         loop_cpu_s: Callable[[], float] = time.thread_time,
         luck: Callable[[], float] = random.random,
+        call_later: Callable[[float, Callable[[], None]], object] = _call_later,
     ) -> None:
         self.refusals: Counter[tuple[str, str]] = Counter(
             {(asked, scarce): 0 for asked in get_args(Asked) for scarce in get_args(Scarce)} | {_REQUEST: 0}
@@ -157,7 +165,14 @@ class Admission:
         self._refused_until_s: deque[float] = deque(maxlen=4 * most_streams)
         self._emitters: deque[int] = deque(maxlen=_SHOWN_EMITTERS)
         self._block_sent_s = limits.block_sent_s
-        self._opening_s = 0.0
+        self._beginnings = Beginnings(
+            spare_cores=float(cores),
+            most_ahead_s=limits.most_opening_s,
+            patience_s=limits.turn_patience_s,
+            is_behind=lambda: engine.has_first_work_waiting,
+            call_later=call_later,
+            time_s=time_s,
+        )
         self._measured_s, self._measured_cpu_s = time_s(), 0.0
 
     @property
@@ -189,11 +204,11 @@ class Admission:
             # The event loop does other work too, so blocks take no more than what it took when it took least.
             seen_s = cpu_passed_s / passed_s / blocks_hz
             self._block_sent_s = min(seen_s, 1.01 * self._block_sent_s)
-        self._opening_s = max(0.0, self._opening_s - passed_s * self.spare_cores)
         self._learn(now_s)
         load = self.load()
         self.headroom = headroom(self._limits, self._thresholds, load)
         self.spare_cores = spare_cores(self._limits, self._thresholds, load)
+        self._beginnings.spare_cores = spare_cores(self._limits, self._thresholds, self._load_now())
         left = self.spare_cores - load.demand - load.eased_demand
         self.background_share = max(self._limits.least_background, left / 2) if load.streams else math.inf
         self._announce(load)
@@ -203,24 +218,28 @@ class Admission:
 
     def load(self) -> ServerLoad:
         """Return what all streams take, those with a place but not opened yet included."""
+        return self._load_now().plus_all(
+            (place.thread, self._expected_by_then(place)) for place in self._places if place.stream is None
+        )
+
+    def _load_now(self) -> ServerLoad:
+        """Return what open streams take."""
         now_s = self._time_s()
         by_thread = self._engine.streams_by_thread()
         numbers = {thread: number for number, thread in enumerate(self._engine.threads)}
-        load = ServerLoad(
+        alone = ServerLoad(
             threads=tuple(self._own_load(thread, by_thread[thread]) for thread in self._engine.threads),
             cores=self._cores,
             workers=self._engine.workers,
-            opening_s=self._opening_s,
+            opening_s=self._beginnings.done_in_s,
+            turn_in_s=self._beginnings.turn_in_s,
             most_streams=self._most_streams,
         )
-        for thread, streams in by_thread.items():
-            for stream in streams:
-                load = load.plus(numbers.get(thread, 0), self._cost_of(stream, now_s))
-        for place in self._places:
-            if place.stream is None:
-                cost = self._expected_by_then(place)
-                load = load.plus(place.thread, replace(cost, opening_s=0.0))
-        return load
+        return alone.plus_all(
+            (numbers.get(thread, 0), self._cost_of(stream, now_s))
+            for thread, streams in by_thread.items()
+            for stream in streams
+        )
 
     def offer(self, kind: StreamKind, step: QualityStep) -> None:
         """Note the cheapest step of a kind of streams, by which clients are turned away."""
@@ -241,7 +260,7 @@ class Admission:
         found: Scarce | None = None
         for kind, step in self._cheapest.values():
             found = self._obstacle(load, thread, self._cost_on(kind, step, 1, is_top=False))
-            if found is None or found == "opening":
+            if found is None:
                 return None
         return None if found is None else self._refuse("upgrade", found)
 
@@ -277,6 +296,33 @@ class Admission:
             if self._obstacle(load, thread, self._cost_on(kind, step, reserved, listeners, is_top=False)) is None
         )
         return self._refuse("hello", found, level=next(fitting, None))
+
+    async def take_turn(self, place: Place, *, is_there: Callable[[], bool]) -> Refusal | None:
+        """Wait until it is the turn of a place that was just taken to begin. If it does not come soon, or the client
+        `is_there` no longer, give the place back and return a refusal."""
+        turn: asyncio.Future[Refusal | None] = asyncio.get_running_loop().create_future()
+        self.await_turn(place, lambda refusal: None if turn.done() else turn.set_result(refusal), is_there=is_there)
+        return await turn
+
+    def await_turn(
+        self, place: Place, settle: Callable[[Refusal | None], None], *, is_there: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Call `settle` as soon as it is the turn of a place: at once if nobody begins. If the turn does not come soon,
+        the place is given back, and it gets a refusal."""
+
+        def refuse() -> None:
+            self.leave(place)
+            settle(self._refuse("hello", "opening"))
+
+        if place.kind is None or not self._is_on:
+            settle(None)
+            return
+        self._beginnings.enter(
+            self._expected_by_then(place).opening_s,
+            partial(settle, None),
+            refuse,
+            is_wanted=lambda: place in self._places and is_there(),
+        )
 
     def open(self, place: Place, stream: Stream) -> None:
         """Note that the stream of a place begins, before the engine opens it."""
@@ -415,10 +461,8 @@ class Admission:
         # Until its stream begins, a place is kept without end.
         place = Place(kind, step, is_top, thread, emitters=0, reserved=reserved, until_s=math.inf, seats=seats)
         self._places[place] = None
-        if kind is not None:
-            self._opening_s += self._expected_by_then(place).opening_s
-            if self._is_on:
-                self._announce(self.load())
+        if kind is not None and self._is_on:
+            self._announce(self.load())
         return place
 
     def _refuse(self, asked: Asked, scarce: Scarce, *, level: str | None = None) -> Refusal:

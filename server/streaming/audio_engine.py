@@ -152,6 +152,11 @@ class AudioEngine:
         """The number of threads that compute IRs."""
         return self._workers.threads
 
+    @property
+    def has_first_work_waiting(self) -> bool:
+        """Whether first IRs or plans wait for a worker."""
+        return self._workers.has_urgent
+
     def streams_by_thread(self) -> dict["AudioThread", list[Stream]]:
         """Return the open streams of each thread."""
         streams: dict[AudioThread, list[Stream]] = {thread: [] for thread in self.threads}

@@ -10,13 +10,14 @@ A newcomer fits if, with it,
 - audio threads, event loop and the least share for responses fit on the cores;
 - nobody waits longer for impulse responses (IRs) than the load policy allows: those on top of their ladders, who ask
   for IRs as often as they like, and those below, who share a part of a core;
-- the first IRs of all newcomers delay those of the others by less than that.
+- the first IRs of newcomers delay those of the others by less than that: newcomers begin one after the other
+  (`server.streaming.beginnings`), and one who would wait too long for a turn does not fit.
 
 Shares are shares of one core. What audio threads take is stated *at one block at once*: `busy` converts it.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
@@ -49,15 +50,21 @@ class Limits:
     """Share of the time left for IRs that streams on top of their ladders may ask for together for waits to be short.
     Beyond it, each waits for one request of all others in turn."""
     most_opening_s: float = 0.05
-    """Seconds for which the first IRs of newcomers may keep the workers. They go before all others, and two periods of
-    the load policy with long waits are one too many."""
+    """Seconds that newcomers may still take to begin when the next one does. Their first IRs go before all others, and
+    two periods of the load policy with long waits are one too many."""
+    most_turn_s: float = 0.5
+    """Seconds after which a newcomer's turn to begin has to be expected. Who is refused is to know within a second."""
+    turn_patience_s: float = 0.6
+    """Seconds after which a newcomer is refused whose turn has not come."""
 
     poses_hz: float = 30.0
     """Poses per second that a newcomer is expected to send, and with that the IRs that it asks for at its best."""
     block_sent_s: float = 40e-6
     """CPU seconds of the event loop for a block, until the server has measured its own."""
-    plan_s: float = 5e-3
-    """CPU seconds of a newcomer's first plan of effects, beside its first IRs."""
+    begin_s: float = 8e-3
+    """CPU seconds that a newcomer's beginning takes beside its emitters: a session, a plan of effects, messages."""
+    begin_emitter_s: float = 0.5e-3
+    """CPU seconds for each emitter of a newcomer beside its first IR: its part of the plan, and its messages."""
     shown_after_s: float = 4.0
     """Seconds after its last emitter for which a stream counts with its expected cost, if that is more than what it has
     shown: first IRs, plans and the walk of the listener come meanwhile."""
@@ -87,6 +94,8 @@ class Limits:
 
 
 LIMITS: Final = Limits()
+LEAST_PACE: Final = 0.1
+"""Cores that beginnings get at least, however little others leave: responses always have a share."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +136,8 @@ class Correction:
 class StreamCost:
     """What a stream takes: `rendering` as a share of a core at one block at once, `loop` as a share of the event loop,
     and `rate_hz` requests for IRs per second of `request_s` CPU seconds each, for which it waits `patience_s`.
-    `opening_s` is the CPU time of its first IRs. `encoding` is the share of a core that its encoder takes. A stream
-    that `is_top` is on top of its ladder; one that `is_live` gets one block at a time."""
+    `opening_s` is the CPU time of its beginning, with its first IRs. `encoding` is the share of a core that its encoder
+    takes. A stream that `is_top` is on top of its ladder; one that `is_live` gets one block at a time."""
 
     rendering: float
     loop: float = 0.0
@@ -172,7 +181,7 @@ def expected_cost(
         request_s=request_s,
         rate_hz=rate_hz,
         patience_s=patience_s(thresholds, step),
-        opening_s=new_s + listeners * limits.plan_s,
+        opening_s=new_s + listeners * (limits.begin_s + emitters * limits.begin_emitter_s),
         is_top=is_top,
         is_live=is_live,
     )
@@ -187,9 +196,9 @@ class ThreadLoad:
     live: float = 0.0
     streams: int = 0
 
-    def plus(self, cost: StreamCost) -> "ThreadLoad":
-        live = cost.rendering if cost.is_live else 0.0
-        return ThreadLoad(self.ahead + cost.rendering - live, self.live + live, self.streams + 1)
+    def plus(self, *costs: StreamCost) -> "ThreadLoad":
+        live, ahead = (sum(cost.rendering for cost in costs if cost.is_live is is_live) for is_live in (True, False))
+        return ThreadLoad(self.ahead + ahead, self.live + live, self.streams + len(costs))
 
     def minus(self, cost: StreamCost) -> "ThreadLoad":
         live = cost.rendering if cost.is_live else 0.0
@@ -201,8 +210,8 @@ class ServerLoad:
     """What all streams take. Of those on top of their ladders, `demand` is the share of a core for all their requests
     for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
     below, `eased_demand` is the share of a core and `eased_round_s` the CPU time of one request of each. `opening_s` is
-    the CPU time of first IRs that are still to be
-    computed. `encoding` is the share of a core of all encoders."""
+    how long those that begin are still likely to be at it, and `turn_in_s` when whoever comes now is likely to have its
+    turn. `encoding` is the share of a core of all encoders."""
 
     threads: tuple[ThreadLoad, ...]
     cores: int
@@ -215,6 +224,7 @@ class ServerLoad:
     eased_demand: float = 0.0
     eased_round_s: float = 0.0
     opening_s: float = 0.0
+    turn_in_s: float = 0.0
     most_streams: int = 1
 
     @property
@@ -223,27 +233,41 @@ class ServerLoad:
 
     def plus(self, thread: int, cost: StreamCost) -> "ServerLoad":
         """Return the load with one more stream on a thread."""
+        return self.plus_all([(thread, cost)])
+
+    def plus_all(self, newcomers: Iterable[tuple[int, StreamCost]]) -> "ServerLoad":
+        """Return the load with more streams, each on the thread of that number. Whoever asks is answered from such a
+        sum, so it is made in one go."""
+        newcomers = list(newcomers)
+        costs = [cost for _, cost in newcomers]
+        top, eased = ([cost for cost in costs if cost.is_top is is_top] for is_top in (True, False))
+        added: list[list[StreamCost]] = [[] for _ in self.threads]
+        for number, cost in newcomers:
+            added[number].append(cost)
         return replace(
-            self._with(thread, self.threads[thread].plus(cost), cost, 1),
-            patience_s=min(self.patience_s, cost.patience_s) if cost.is_top else self.patience_s,
-            opening_s=self.opening_s + cost.opening_s,
+            self,
+            threads=tuple(thread.plus(*some) for thread, some in zip(self.threads, added, strict=True)),
+            loop=self.loop + sum(cost.loop for cost in costs),
+            encoding=self.encoding + sum(cost.encoding for cost in costs),
+            demand=self.demand + sum(cost.demand for cost in top),
+            round_s=self.round_s + sum(cost.request_s for cost in top),
+            patience_s=min((self.patience_s, *(cost.patience_s for cost in top))),
+            eased_demand=self.eased_demand + sum(cost.demand for cost in eased),
+            eased_round_s=self.eased_round_s + sum(cost.request_s for cost in eased),
         )
 
     def minus(self, thread: int, cost: StreamCost) -> "ServerLoad":
-        """Return the load without a stream of a thread; patience and first IRs stay as they are."""
-        return self._with(thread, self.threads[thread].minus(cost), cost, -1)
-
-    def _with(self, number: int, thread: ThreadLoad, cost: StreamCost, sign: int) -> "ServerLoad":
-        top, eased = (cost.demand, 0.0) if cost.is_top else (0.0, cost.demand)
+        """Return the load without a stream of a thread; patience stays as it is."""
+        top, eased = (cost, None) if cost.is_top else (None, cost)
         return replace(
             self,
-            threads=(*self.threads[:number], thread, *self.threads[number + 1 :]),
-            loop=max(0.0, self.loop + sign * cost.loop),
-            encoding=max(0.0, self.encoding + sign * cost.encoding),
-            demand=max(0.0, self.demand + sign * top),
-            round_s=max(0.0, self.round_s + sign * (cost.request_s if cost.is_top else 0.0)),
-            eased_demand=max(0.0, self.eased_demand + sign * eased),
-            eased_round_s=max(0.0, self.eased_round_s + sign * (0.0 if cost.is_top else cost.request_s)),
+            threads=(*self.threads[:thread], self.threads[thread].minus(cost), *self.threads[thread + 1 :]),
+            loop=max(0.0, self.loop - cost.loop),
+            encoding=max(0.0, self.encoding - cost.encoding),
+            demand=max(0.0, self.demand - (top.demand if top else 0.0)),
+            round_s=max(0.0, self.round_s - (top.request_s if top else 0.0)),
+            eased_demand=max(0.0, self.eased_demand - (eased.demand if eased else 0.0)),
+            eased_round_s=max(0.0, self.eased_round_s - (eased.request_s if eased else 0.0)),
         )
 
 
@@ -279,7 +303,10 @@ def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: i
         return "streams"
     if load.streams == 0:
         return None
-    return _scarce(limits, thresholds, load.plus(thread, cost), thread, cost)
+    found = _scarce(limits, thresholds, load.plus(thread, cost), thread, cost)
+    if found is None and cost.opening_s and load.turn_in_s > limits.most_turn_s:
+        return "opening"
+    return found
 
 
 def obstacle_to_change(
@@ -293,7 +320,10 @@ def obstacle_to_change(
     if not dearer:
         return None
     changed = load.minus(thread, before).plus(thread, after)
-    return _scarce(limits, thresholds, changed, thread, after)
+    found = _scarce(limits, thresholds, changed, thread, after)
+    if found is None and after.opening_s and load.opening_s > limits.most_opening_s:
+        return "opening"
+    return found
 
 
 def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
@@ -316,9 +346,7 @@ def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: in
         share = ir_share(thresholds, busy=_settled(limits, thresholds, load.threads[thread]))
         interval_s = cost.request_s * load.threads[thread].streams / share
         is_lasting = interval_s <= 1 / thresholds.least_ir_rate_hz
-    if not is_lasting:
-        return "responses"
-    return "opening" if load.opening_s > limits.most_opening_s * spare else None
+    return None if is_lasting else "responses"
 
 
 def fits_on_top(

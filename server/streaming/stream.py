@@ -356,13 +356,14 @@ class Stream:
         self.shown.note(rendering=rendering, responses=responses, memory=memory)
 
     def sample_load(self, now_s: float) -> LoadSample:
-        """Return the load of this stream since the last call."""
+        """Return the load of this stream since the last call. Its wait for IRs does not count before `is_measured`: its
+        first responses come when it is their turn, and to step down would only have all of them computed anew."""
         lateness_s = max(self._worst_lateness_s, self._worst_sent_s)
         self._worst_lateness_s = self._worst_sent_s = 0.0
         lateness = lateness_s / (self._lead * self.block_s)
         waits_s = [member.wait.take_longest_s(now_s) for member in self.audience.members]
         longest_s = max((wait_s for wait_s in waits_s if wait_s is not None), default=None)
-        return LoadSample(lateness, longest_s, self.request_s, self._costs.plan_s)
+        return LoadSample(lateness, longest_s if self.is_measured else None, self.request_s, self._costs.plan_s)
 
     def note_sent(self, deadline_s: float, now_s: float) -> bool:
         """Note that a block is sent now; return whether it is late. The sender calls this: a block that is ready in

@@ -2,13 +2,14 @@
 
 import asyncio
 import itertools
+import time
 
 import numpy as np
 import pytest
 from websockets.frames import Frame, Opcode
 from websockets.streams import StreamReader
 
-from server.bench.crowd import FrameReader, Walker, frame
+from server.bench.crowd import Crowd, FrameReader, Walker, frame
 from server.bench.gauge import BLOCK_LISTENER, POSE_ID, POSE_IDS, POSE_LISTENER
 from server.bench.places import Places
 from server.bench.scene import bundle_of
@@ -157,3 +158,40 @@ def test_each_listener_of_a_stream_walks_acknowledges_and_waits_for_itself():
     assert acknowledged == [Acknowledge(sequence=number, listener="listener-2") for number in (0, 4)]
     assert waiting == {0: 1, 1: 1, 2: 0}
     assert blocks == 5
+
+
+def test_a_rush_asks_at_once_and_its_preparation_is_nobodys_wait():
+    """Where emitters are is chosen before the first connects, and a wait begins when its client connects."""
+    told: list[str] = []
+    places = Places.of(bundle_of("apartment"))
+
+    class Chosen:
+        bundle, walk = places.bundle, places.walk
+
+        def emitters(self, count, _):
+            told.append("chosen")
+            return [self.walk] * count
+
+    async def refuse(reader, writer):
+        told.append("asked")
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 7\r\nContent-Length: 0\r\n\r\n")
+        writer.close()
+        await writer.wait_closed()
+
+    async def run():
+        async with await asyncio.start_server(refuse, "127.0.0.1", 0) as server:
+            crowd = Crowd(server.sockets[0].getsockname()[1], Chosen(), emitters=2, poses_per_s=0.0)
+            before_s = time.monotonic()
+            rush = await crowd.rush(5)
+            assert not crowd.walkers
+            for walker in rush.walkers:
+                walker.close()
+            return before_s, rush
+
+    before_s, rush = asyncio.run(run())
+    assert told == ["chosen"] * 5 + ["asked"] * 5
+    assert [walker.retry_after_s for walker in rush.walkers] == [7] * 5
+    assert all(before_s < walker.asked_s < walker.answered_s for walker in rush.walkers)
+    assert 0.0 <= rush.stall_s < 60.0
+    assert rush.load > 0.0

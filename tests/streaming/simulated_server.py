@@ -366,6 +366,8 @@ class Client:
     began_at: int = 0
     """The step on which the server let it in."""
     refused: Refusal | None = None
+    answered_s: float = _NEVER
+    """When it was let in or refused."""
     place: Place | None = None
 
 
@@ -427,6 +429,7 @@ class SimulatedServer:
             time_s=self.machine,
             loop_cpu_s=lambda: self._loop_s,
             luck=lambda: float(self._rng.random()),
+            call_later=lambda seconds, call: self.machine.at(self.machine.now_s + seconds, call),
         )
         self._kind = self._measured_kind(speeds[0]) if admits else None
         if self._kind is not None:
@@ -497,6 +500,11 @@ class SimulatedServer:
 
     # What the audio engine asks of what is around it.
 
+    @property
+    def has_urgent(self) -> bool:
+        """As workers: whether urgent work waits."""
+        return bool(self.machine._urgent)
+
     def _measured_kind(self, speed: float) -> StreamKind:
         """What a server measures when it starts: costs of one stream alone."""
         each_s, exchange_s = self._costs.block_s / 16 / speed, self._costs.exchange_s / 16 / speed
@@ -513,10 +521,17 @@ class SimulatedServer:
         if answer is None:
             answer = self.admission.admit(self._kind, steps, client.emitters if announces else None)
         if isinstance(answer, Refusal):
-            client.refused = answer
+            client.refused, client.answered_s = answer, self.now_s
             return
         client.place, client.began_at = answer, steps.index(answer.step)
-        self._open(client)
+        self.admission.await_turn(answer, lambda missed: self._take_turn(client, missed))
+
+    def _take_turn(self, client: Client, missed: Refusal | None) -> None:
+        client.answered_s = self.now_s
+        if missed is None:
+            self._open(client)
+        else:
+            client.refused, client.place = missed, None
 
     def _leave(self, client: Client) -> None:
         if client.stream is not None:
@@ -542,7 +557,7 @@ class SimulatedServer:
             for _ in range(client.emitters):
                 assert self.admission.add_emitter(client.place, is_live=False) is None
         self.engine.open(client.stream)
-        self._move(client, client.opened_s + self.began_s, 1)
+        self._move(client, self.machine.now_s, 1)
 
     def _move(self, client: Client, first_s: float, pose_id: int) -> None:
         if self.now_s >= client.closed_s:

@@ -65,11 +65,43 @@ def test_more_blocks_at_once_make_room_but_not_for_live_samples():
         (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=30.0, patience_s=0.15, is_top=True), "responses"),
         (replace(crowd(2), encoding=1.5), StreamCost(0.1, encoding=0.3), "cores"),
         (crowd(2), StreamCost(0.1, request_s=0.2, rate_hz=2.0), "responses"),
-        (crowd(2), StreamCost(0.1, request_s=0.001, rate_hz=2.0, opening_s=0.2), "opening"),
+        (replace(crowd(2), turn_in_s=1.0), StreamCost(0.1, request_s=0.001, rate_hz=2.0, opening_s=0.02), "opening"),
     ],
 )
 def test_what_is_scarce_is_named(load, cost, scarce):
     assert found(load, cost) == scarce
+
+
+def test_what_a_newcomer_itself_takes_to_begin_keeps_nobody_out():
+    """On a busy server it may take long; nobody else begins then, and one who never fits would be told to come back for
+    ever."""
+    newcomer = StreamCost(0.1, request_s=0.001, rate_hz=2.0, opening_s=0.5)
+    assert found(crowd(6), newcomer) is None
+    present = StreamCost(0.05, request_s=0.001, rate_hz=2.0)
+    with_more = replace(present, request_s=0.002, opening_s=0.5)
+    assert obstacle_to_change(LIMITS, THRESHOLDS, crowd(6), 0, present, with_more) is None
+    others_begin = replace(crowd(6), opening_s=2 * LIMITS.most_opening_s)
+    assert obstacle_to_change(LIMITS, THRESHOLDS, others_begin, 0, present, with_more) == "opening"
+
+
+def test_streams_together_are_as_much_as_one_after_the_other():
+    cost = StreamCost(0.0, loop=0.01, request_s=0.003, rate_hz=12.0)
+    some = [
+        (
+            number % 2,
+            replace(cost, rendering=0.1 + number, patience_s=0.1 * number, is_top=number > 1, is_live=number == 3),
+        )
+        for number in range(1, 5)
+    ]
+    load = EMPTY
+    for thread, cost in some:
+        load = load.plus(thread, cost)
+    together = EMPTY.plus_all(some)
+    assert together.threads[0].ahead == pytest.approx(load.threads[0].ahead)
+    assert (together.streams, together.patience_s) == (4, pytest.approx(0.2))
+    assert (together.round_s, together.eased_demand) == (pytest.approx(0.009), pytest.approx(0.036))
+    assert together.threads[1] == ThreadLoad(pytest.approx(1.1), pytest.approx(3.1), 2)
+    assert together.loop == pytest.approx(load.loop)
 
 
 def test_what_makes_nothing_dearer_fits_on_a_full_server():

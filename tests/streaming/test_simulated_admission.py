@@ -66,6 +66,23 @@ def test_every_stream_is_counted_once(name):
     assert load.streams > 0
 
 
+@cache
+def crowd(name, every_s):
+    server = SimulatedServer(speeds=CORES[name], admits=True)
+    server.arrive(40, at_s=1.0, every_s=every_s, emitters=16)
+    return server.run(1.0 + 40 * every_s + 5.0)
+
+
+@each
+def test_of_those_who_ask_in_one_moment_most_that_fit_are_let_in_and_all_are_answered_soon(name):
+    """Streams that begin wait for each other, and not for a later try."""
+    at_once = crowd(name, 0.0)
+    assert late_share(admitted(at_once)) < 0.001
+    assert most_steps_down(admitted(at_once)) <= 0
+    assert len(admitted(at_once)) >= len(admitted(crowd(name, 0.2))) / 2
+    assert all(client.answered_s - client.opened_s < 1.0 for client in at_once.clients)
+
+
 def test_without_admission_the_same_clients_break_the_sound():
     server = SimulatedServer(speeds=CORES["two slow cores"])
     server.arrive(60, at_s=1.0, every_s=0.02)
