@@ -13,7 +13,7 @@ Axes: B poses; responses (B, ear, sample). Lengths are in metres; positions and 
 import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from server.acoustics.decibels import amplitude_to_db, db_to_power
 from server.acoustics.directivity import OMNIDIRECTIONAL
 from server.acoustics.geometry import Pose
 from server.acoustics.surroundings import Surroundings
+from server.core.bounded_cache import BoundedCache
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import TAPS
 from server.rendering.hrtf import HeadFilters, NoHead
@@ -34,6 +35,9 @@ from server.scene.geometry import Material
 from server.scene.surfaces import mirror_gains_db, wall_losses_db
 
 _Floats = npt.NDArray[np.float64]
+_Paths = tuple[_Floats, _Floats, _Floats]
+_KEPT_PAIRS = 256
+"""Pairs of listener and emitter whose paths are kept, at most some 6 kB each."""
 
 
 class EarlyReflections:
@@ -64,6 +68,7 @@ class EarlyReflections:
         self.end_samples = math.ceil((longest_s + filters.longest_delay_s) * filters.sample_rate) + filters.taps + TAPS
         """The sample of a response from which on it contains no reflection."""
         self._air_db_per_m = air_db_per_m
+        self._kept = _new_cache()
         self._paths = StillPaths(filters, speed_of_sound=speed_of_sound, air_db_per_m=air_db_per_m)
 
     @classmethod
@@ -85,19 +90,28 @@ class EarlyReflections:
         """The same in other surroundings, as large and of the same materials: where doors have moved."""
         moved = copy.copy(self)
         moved._finder = surroundings.first_reflections(*self._gains_and_losses_db)
+        moved._kept = _new_cache()
         return moved
 
-    def add(self, responses: npt.NDArray[np.float32], listener: Pose, emitters: Sequence[EmitterState]) -> None:
+    def add(
+        self,
+        responses: npt.NDArray[np.float32],
+        listener: Pose,
+        emitters: Sequence[EmitterState],
+        *,
+        remember: bool = False,
+    ) -> None:
         """Add the first reflections of each emitter at `listener` to its response (B, channel, sample); sample 0 is
-        emission.
+        emission. With `remember`, paths are kept for when the head turns and nothing else moves.
 
         A renderer multiplies these responses by the emitter's `reverberation_gain`, which is right for diffuse sound.
         Here it is divided out, and each path has the gain of its own direction.
         """
-        for response, paths in zip(responses, self.paths(listener, emitters), strict=True):
+        find = self._remembered if remember else self.paths
+        for response, paths in zip(responses, find(listener, emitters), strict=True):
             self._paths.add(*paths, listener.orientation, response)
 
-    def paths(self, listener: Pose, emitters: Sequence[EmitterState]) -> list[tuple[_Floats, _Floats, _Floats]]:
+    def paths(self, listener: Pose, emitters: Sequence[EmitterState]) -> list[_Paths]:
         """For each emitter the n paths that `add` adds: lengths (n,), arrivals (n, 3), and gains (n, band) in dB
         without distance and air."""
         found = self._finder.find(listener.position, [emitter.pose.position for emitter in emitters])
@@ -111,6 +125,17 @@ class EarlyReflections:
                 gain_db += departure_gain_db(emitter, departure) - played_db
         return [(found.length_m[part], found.arrival[part], found.gain_db[part]) for part in parts]
 
+    def _remembered(self, listener: Pose, emitters: Sequence[EmitterState]) -> list[_Paths]:
+        keys = [(listener.position, *_departure_of(emitter)) for emitter in emitters]
+        known = [self._kept.get(key) for key in keys]
+        missing = [row for row, paths in enumerate(known) if paths is None]
+        if missing:
+            found = self.paths(listener, [emitters[row] for row in missing])
+            for row, paths in zip(missing, found, strict=True):
+                known[row] = paths
+                self._kept.put(keys[row], paths if len(missing) == 1 else _copied(paths), 1)
+        return [paths for paths in known if paths is not None]
+
     def band_power(self, listeners: _Floats, emitter: npt.ArrayLike) -> _Floats:
         """Return the squared pressure (B, band) of the reflections at `listeners` (B, 3) from one omnidirectional
         emitter (3,)."""
@@ -122,6 +147,22 @@ class EarlyReflections:
         spread = np.maximum(found.length_m, NEAR_LIMIT_M)[:, None] ** 2
         np.add.at(power, found.emitter, db_to_power(levels_db) / spread)
         return power
+
+
+def _departure_of(emitter: EmitterState) -> tuple[Hashable, ...]:
+    """What of an emitter decides how its sound departs."""
+    pose, directivity = emitter.pose, emitter.directivity
+    return (pose.position,) if directivity is OMNIDIRECTIONAL else (pose.position, pose.orientation, directivity)
+
+
+def _new_cache() -> BoundedCache[Hashable, _Paths]:
+    return BoundedCache(_KEPT_PAIRS)
+
+
+def _copied(paths: _Paths) -> _Paths:
+    """The same paths in arrays of their own, so that no larger ones are kept."""
+    length_m, arrival, gain_db = paths
+    return length_m.copy(), arrival.copy(), gain_db.copy()
 
 
 def _starts(emitter: npt.NDArray[np.int64], count: int) -> Sequence[int]:

@@ -106,5 +106,5 @@ def _with_first_reflections(
         late = _Late(samples, renderer.prepare(samples))
         cache.put(key, late, samples.nbytes + late.prepared.nbytes)
     samples = late.samples.copy()
-    early.add(samples[np.newaxis], listener, [emitter])
+    early.add(samples[np.newaxis], listener, [emitter], remember=True)
     return renderer.prepare(samples, like=late.prepared, same_from=early.end_samples)

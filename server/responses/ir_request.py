@@ -107,10 +107,11 @@ def composed_irs(
     early = direct.early(channels)
     mirrored = [row for row, emitter in enumerate(emitters) if emitter.effects.early]
     if early is not None and 0 < len(mirrored) == count:
-        add_first_reflections(field, early, irs, listener, emitters)
+        add_first_reflections(field, early, irs, listener, emitters, remember=remember)
     elif early is not None and mirrored:
         reflected = irs[mirrored]
-        add_first_reflections(field, early, reflected, listener, [emitters[row] for row in mirrored])
+        some = [emitters[row] for row in mirrored]
+        add_first_reflections(field, early, reflected, listener, some, remember=remember)
         irs[mirrored] = reflected
     standing = [row for row, emitter in enumerate(emitters) if emitter.effects.bakes_direct]
     if standing:

@@ -22,11 +22,13 @@ def add_first_reflections(
     responses: npt.NDArray[np.float32],
     listener: Pose,
     emitters: Sequence[EmitterState],
+    *,
+    remember: bool = False,
 ) -> None:
     """Add first reflections as `EarlyReflections.add` does, at a field's level: those of the poses, or those of the
     lattice node whose response is reused."""
     if not field.kind.shares_reflections:
-        early.add(responses, listener, emitters)
+        early.add(responses, listener, emitters, remember=remember)
         return
     for response, emitter in zip(responses, emitters, strict=True):
         node, later = field.snap(listener.position, emitter.pose.position, listener.yaw)

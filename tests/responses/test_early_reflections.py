@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 
-from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT
+from server.acoustics.directivity import CARDIOID, FIGURE_OF_EIGHT, Cardioid
 from server.acoustics.geometry import Pose
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello, MoveEmitter
@@ -77,6 +77,52 @@ def test_heads_may_nod_and_each_emitter_has_its_own(early, mirrored_bundle, filt
     early.add(responses, listener, [EmitterState(Pose(tuple(place))) for place in places])
     for response, place in zip(responses, places, strict=True):
         assert_allclose(response, free_field(mirrored_bundle, filters, images(place), listener, SURFACE_DB), atol=1e-5)
+
+
+def test_a_head_that_only_turned_has_paths_that_are_found_once(early, mirrored_bundle, monkeypatch):
+    """For every emitter, however it is turned and whatever its directivity; where doors moved, they are found anew."""
+    asked = []
+    find = early._finder.find
+    monkeypatch.setattr(early._finder, "find", lambda at, places: asked.append(len(places)) or find(at, places))
+    turned = Pose.from_yaw(tuple(EMITTER), 2.0)
+    emitters = [
+        EmitterState(Pose(tuple(EMITTER))),
+        EmitterState(turned, CARDIOID),
+        EmitterState(turned, FIGURE_OF_EIGHT),
+    ]
+
+    def heard(reflections, listener, some, *, remember):
+        responses = np.zeros((len(some), 2, SAMPLES), np.float32)
+        reflections.add(responses, listener, some, remember=remember)
+        return responses
+
+    def assert_same(listener, some):
+        assert_array_equal(
+            heard(early, listener, some, remember=True), heard(early, listener, some, remember=False), strict=True
+        )
+        asked.pop()
+
+    for yaw in (0.0, 1.0):
+        assert_same(Pose.from_yaw(tuple(LISTENER), yaw), emitters[1:])
+    assert asked == [2]
+    assert_same(Pose(tuple(LISTENER)), emitters)
+    assert asked == [2, 1]
+    elsewhere = Pose.from_yaw(tuple(EMITTER), 2.1)
+    for listener, emitter in (
+        (Pose((2.0, 2.5, 1.6)), emitters[0]),
+        (Pose(tuple(LISTENER)), EmitterState(Pose((5.0, 3.2, 1.3)))),
+        (Pose(tuple(LISTENER)), EmitterState(elsewhere, CARDIOID)),
+        (Pose(tuple(LISTENER)), EmitterState(turned, Cardioid(0.4))),
+    ):
+        assert_same(listener, [emitter])
+        assert asked.pop() == 1
+    assert_same(Pose(tuple(LISTENER)), [EmitterState(elsewhere)])
+    assert asked == [2, 1]
+    moved = early.within(mirrored_bundle.surroundings)
+    found = []
+    monkeypatch.setattr(moved._finder, "find", lambda *poses: found.append(poses) or find(*poses))
+    heard(moved, Pose(tuple(LISTENER)), emitters, remember=True)
+    assert len(found) == 1
 
 
 @pytest.mark.parametrize("directivity", [CARDIOID, FIGURE_OF_EIGHT])
