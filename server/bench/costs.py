@@ -3,7 +3,10 @@
 
 The runs are those of `nafir bench stream`. The numbers of sessions follow from the runs before: two, then half of what
 the model says that the core bears, then nearly all, and in the end more than it bears: a server that is asked for too
-much shows what share of the core it gets, and what blocks cost when as many as possible are rendered at once.
+much shows what share of the core it gets, and what blocks cost when as many as possible are rendered at once. From few
+sessions the model may expect far too many, which take long to open and longer to fail. So no run has more than
+`_GROWTH` times the sessions of the one before, one that does not open is tried again with fewer, and none follows one
+that was more than the core bears.
 """
 
 import asyncio
@@ -30,6 +33,12 @@ STEP_S = 4.0
 _FEW = 2
 _SHARES = 0.0, 0.5, 0.9, 1.2
 """Shares of what a core bears at which it is measured; the last is more than it bears."""
+_GROWTH = 3.0
+_FEWER = 0.7
+"""Share of the sessions that did not open with which a run is tried again."""
+_TRIES = 3
+_OVERLOADED = 0.1
+"""Late share of a run that was certainly more than the core bears."""
 _MOST = 400
 _LEAST_USABLE = 0.5
 _SPARE: dict[Thread, str] = {"audio": "waking (audio)", "loop": "waking (loop)", "worker": "waking (workers)"}
@@ -64,8 +73,13 @@ async def _measure(measured: Measured, places: Places, port: int, step_s: float,
         trial = Trial(port, crowd, advance)
         try:
             for share in _SHARES:
+                before = [run for run in measured.runs if run.emitters == emitters]
+                if share > 1 and before[-1].late_share >= _OVERLOADED:
+                    continue
                 sessions = _sessions(measured, emitters, share) if share else _FEW
-                if any((run.sessions, run.emitters) == (sessions, emitters) for run in measured.runs):
+                if before:
+                    sessions = min(sessions, round(_GROWTH * max(run.sessions for run in before)))
+                if any(run.sessions == sessions for run in before):
                     continue
                 found = await _try(trial, sessions, step_s, is_needed=share < 1)
                 if found is not None:
@@ -78,12 +92,13 @@ async def _measure(measured: Measured, places: Places, port: int, step_s: float,
 
 
 async def _try(trial: Trial, sessions: int, step_s: float, *, is_needed: bool) -> dict[str, Any] | None:
-    """The report of a run in which there were blocks; None for a run that failed and is not needed. Raises NafirError
-    if it is."""
-    for _ in range(2 if is_needed else 1):  # another tenant may have stopped the machine
+    """The report of a run in which there were blocks, if need be with fewer sessions; None for a run that failed and is
+    not needed. Raises NafirError if it is."""
+    for _ in range(_TRIES if is_needed else 1):
         found = await trial.run(sessions, step_s)
         if found.get("blocks_sent"):
             return found
+        sessions = max(1, round(_FEWER * sessions))
     if not is_needed:
         return None
     why = "; ".join(found["errors"]) or "no block was sent"

@@ -337,6 +337,7 @@ class Crowd:
 
         async def ask(number: int) -> Walker:
             walker = await self._connect(number, chosen[number])
+            walker.sounds.add_done_callback(_heed)  # it may fail after its time is over
             with contextlib.suppress(ConnectionError, TimeoutError):
                 await asyncio.wait_for(asyncio.shield(walker.sounds), _PATIENCE_S)
             return walker
@@ -370,6 +371,12 @@ class Crowd:
 
     async def close(self) -> None:
         await self.resize(0)
+
+
+def _heed(sounds: asyncio.Future[None]) -> None:
+    """Take note of a failure, of which asyncio would complain otherwise."""
+    if not sounds.cancelled():
+        sounds.exception()
 
 
 async def _longest_stall_s(is_over: asyncio.Event) -> float:

@@ -22,8 +22,8 @@ many, each with poses of its own; counts of blocks and poses are of all of them.
 - `sessions`: the largest number that passes. Steps of a few seconds find it to within 5 %, and a long run confirms it;
   if that fails, a tenth less is tried, and so on. A step ends as soon as it has failed. Unless it fails by far, it is
   tried once more, since other tenants of the machine may have disturbed it.
-- `with_20_sessions`: the same with 16 emitters and 20 listeners, if more are possible. Latency is judged there and not
-  at the limit; where 20 are too many, its goals are missed.
+- `with_20_sessions`: the same with 16 emitters and 20 listeners, if more are possible and runs are long enough for
+  goals. Latency is judged there and not at the limit; where 20 are too many, its goals are missed.
 - `block_ms`: time to render a block, or its share of blocks rendered together. `lateness_ms`: time from when a block
   was due until it was ready.
 - `pose_to_audio_ms`: time from a pose's arrival at the server until the first block that follows it is passed to the
@@ -71,6 +71,8 @@ _SETTLE_S = 2.0
 _LOOK_EVERY_S = 2.0
 _MOST = 512
 _PATIENCE_S = 20.0
+_OPEN_S = 30.0
+"""How long all sessions of a run may take to open: on a server that has room, a thirtieth of a second each."""
 _READY_S = 600.0
 """Limit for becoming ready. Kernels may have to be compiled first."""
 
@@ -128,6 +130,8 @@ class Plan:
     block_size: BlockSize = BLOCK_SIZE
     listeners: int = 1
     """Of each stream."""
+    near: int | None = None
+    """Where the search begins, if it is known about how many sessions there will be."""
 
 
 def measure_sessions(plan: Plan, advance: Advance = lambda _: None) -> dict[str, Any]:
@@ -286,13 +290,23 @@ def failures(cases: list[dict[str, Any]]) -> list[str]:
     return [f"{scene}, {emitters} emitters: {reason}" for scene, emitters, reason in found if reason is not None]
 
 
-async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int) -> int:
+async def find_most(passes: Callable[[int], Awaitable[bool]], *, most: int, near: int | None = None) -> int:
     """The largest number up to `most` that passes, to within 5 %; 0 if none does. Assumes that all numbers below one
-    that passes pass, too."""
+    that passes pass, too. It is found soon if it is `near` a number that is given."""
     good, bad = 0, most + 1
+    first = None if near is None else min(max(1, near), most)
+    stride = max(1, (near or 0) // 10)
     while bad - good > max(1, good // 20):
-        # Numbers are not doubled: a run with far too many sessions takes long to fail, since they hardly open.
-        number = min(max(8, good + good // 2), most) if bad > most else (good + bad) // 2
+        if good and bad <= most:
+            number = (good + bad) // 2
+        elif first is not None:
+            number, first = first, None
+        elif near is not None:
+            number = min(good + stride, most) if good else max(1, bad - stride)
+            stride *= 2
+        else:
+            # Numbers are not doubled: a run with far too many sessions takes long to fail, since they hardly open.
+            number = min(max(8, good + good // 2), most) if bad > most else (good + bad) // 2
         if await passes(number):
             good = number
         else:
@@ -329,11 +343,11 @@ async def _measure_case(plan: Plan, trial: "Trial") -> dict[str, Any]:
             return failure(first) is None
         return failure(await trial.run(sessions, plan.step_s, until_failed=True)) is None
 
-    sessions = await find_most(passes, most=_MOST)
+    sessions = await find_most(passes, most=_MOST, near=plan.near)
     while sessions > 0:
         confirmed = await trial.run(sessions, plan.duration_s, until_failed=True)
         if failure(confirmed) is None:
-            if trial.emitters == 16 and sessions > _JUDGED:
+            if trial.emitters == 16 and sessions > _JUDGED and plan.duration_s >= _GOAL_S:
                 confirmed[_AT_GOAL] = await trial.run(_JUDGED, plan.duration_s)
             return {**confirmed, "is_given": False}
         sessions -= max(1, sessions // 10)
@@ -364,7 +378,11 @@ class Trial:
         return measured
 
     async def _run(self, sessions: int, duration_s: float, until_failed: bool) -> dict[str, Any]:
-        await self.crowd.resize(sessions)
+        try:
+            async with asyncio.timeout(_OPEN_S):
+                await self.crowd.resize(sessions)
+        except TimeoutError as exc:
+            raise TimeoutError(f"not all of {sessions} sessions opened within {_OPEN_S:g} s") from exc
         await asyncio.sleep(_SETTLE_S)
         await self._ask("begin")
         walkers = self.crowd.walkers

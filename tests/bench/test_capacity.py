@@ -1,5 +1,6 @@
 """The model of capacity, against cases that can be computed by hand and runs whose costs are known."""
 
+import asyncio
 import itertools
 import json
 from dataclasses import replace
@@ -269,6 +270,56 @@ def test_a_core_that_bears_no_listener_is_said_to():
     assert (sizing.cores_best, sizing.cores_lowest, sizing.machines) == (0, 0, 0)
 
 
+class Core:
+    """Trials of a server of known costs, on which no more than `opens` sessions open and `bears` are in time. With few
+    sessions a block costs a third of what it does with many, so that the model expects too many of them."""
+
+    def __init__(self, monkeypatch, *, bears, opens):
+        self.bears, self.opens, self.tried = bears, opens, []
+        monkeypatch.setattr(costs, "Crowd", lambda *_, **__: self)
+        monkeypatch.setattr(costs, "Trial", self._trial)
+        monkeypatch.setattr(costs, "run_of", lambda found, _: found["run"])
+
+    def _trial(self, _port, _crowd, _advance):
+        trial = type("FakeTrial", (), {"emitters": costs.EMITTERS[len(self.tried)], "run": self._run})()
+        self.tried.append([])
+        return trial
+
+    async def close(self):
+        pass
+
+    async def _run(self, sessions, _duration_s):
+        self.tried[-1].append(sessions)
+        if sessions > self.opens:
+            return {"sessions": sessions, "late_share": 1.0, "errors": [f"not all of {sessions} sessions opened"]}
+        share = sessions / self.bears * (1 if sessions > self.bears / 2 else 1 / 3)
+        emitters = costs.EMITTERS[len(self.tried) - 1]
+        one = run(sessions, emitters, at_once=8)
+        found = one.model_copy(
+            update={
+                "late_share": 0.0 if sessions <= self.bears else 0.5,
+                "shares": {part: share * each / sum(one.shares.values()) for part, each in one.shares.items()},
+            }
+        )
+        return {"blocks_sent": 1, "server_load": min(1.0, share), "run": found}
+
+
+@pytest.mark.parametrize(("bears", "opens"), [(50, 60), (90, 400), (10, 12), (4, 4), (3, 400)])
+def test_runs_that_measure_costs_come_to_an_end_however_wrong_first_expectations_are(monkeypatch, bears, opens):
+    core = Core(monkeypatch, bears=bears, opens=opens)
+    told = asyncio.run(costs._measure(MEASURED.model_copy(update={"runs": ()}), None, 1, 4.0, lambda _: None))
+    assert len(core.tried) == len(costs.EMITTERS)
+    for tried, emitters in zip(core.tried, costs.EMITTERS, strict=True):
+        opened = [each.sessions for each in told.runs if each.emitters == emitters]
+        assert tried[0] == 2
+        assert len(tried) <= 8
+        for number in tried[1:]:
+            assert number <= 3 * max(each for each in opened if each < number or each == opened[0])
+        assert sum(number > opens for number in tried) <= 4, "runs that do not open take longest"
+        assert sum(number > bears for number in opened) <= 2
+        assert max(opened) > bears / 3
+
+
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "costs.json"
@@ -354,7 +405,7 @@ def test_a_check_that_is_more_than_15_percent_off_ends_with_code_1(file, monkeyp
     found = round(MODEL.most(16) / (1 + off))
 
     def measure(plan, _advance):
-        assert (plan.scenes, plan.emitters, plan.sessions) == (("flat",), (16,), None)
+        assert (plan.scenes, plan.emitters, plan.sessions, plan.near) == (("flat",), (16,), None, MODEL.most(16))
         return {"cases": [{"scene": "flat", "emitters": 16, "sessions": found}]}
 
     monkeypatch.setattr(sessions, "measure_sessions", measure)

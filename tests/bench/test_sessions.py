@@ -35,6 +35,23 @@ def test_the_most_is_found_to_within_five_percent(capacity):
     assert len(set(tried)) == len(tried)
 
 
+@pytest.mark.parametrize("capacity", [0, 1, 3, 20, 40, 199, 512, 10_000])
+@pytest.mark.parametrize("near", [1, 20, 22, 180, 900])
+def test_a_search_from_any_number_finds_the_same_and_from_a_near_one_soon(capacity, near):
+    tried = []
+
+    async def passes(sessions):
+        tried.append(sessions)
+        return sessions <= capacity
+
+    found, reachable = asyncio.run(find_most(passes, most=512, near=near)), min(capacity, 512)
+    assert found <= reachable
+    assert reachable - found < max(1, found / 20)
+    assert tried[0] == min(near, 512)
+    assert len(set(tried)) == len(tried)
+    assert len(tried) <= (4 if abs(near - capacity) <= 0.1 * near else 20)
+
+
 SCENE = "flat"
 
 
@@ -292,6 +309,14 @@ def test_the_most_is_confirmed_by_a_long_run_and_the_goal_measured_besides(long,
     assert [sessions <= long for sessions, _ in long_runs] == [False] * (len(long_runs) - bool(most)) + [True] * bool(
         most
     )
+
+
+def test_a_shorter_run_than_goals_are_for_is_not_followed_by_one_that_judges_latency():
+    trials = Trials(50, 50)
+    case = asyncio.run(bench._measure_case(Plan(duration_s=20.0, near=48), trials))
+    assert case["sessions"] == 50
+    assert "with_20_sessions" not in case
+    assert max(duration_s for _, duration_s, _ in trials.ran) == 20.0
 
 
 @pytest.mark.parametrize(("late_share", "most"), [(0.3, 50), (0.9, 7)])
