@@ -185,20 +185,59 @@ def series_exponential(cepstra: FloatArray, reciprocals: FloatArray, sums: Float
 
     `cepstra` (2, n + 8) holds c[0] and then k c[k], `reciprocals` (n,) 1 and then 1 / k; `sums` (2, n + 8) is a buffer
     for n h[n] = sum over k of k c[k] h[n - k].
+
+    Each tap needs all before it. Therefore eight are found one after the other, in registers, and then added to the
+    sums of all later ones, in vectors.
     """
     count = taps.shape[1]
-    width = cepstra.shape[1]
-    c, s, h = cepstra.ctypes.data, sums.ctypes.data, taps.ctypes.data
+    whole = count // 8 * 8
     sums[:] = 0
     for ear in range(2):
-        taps[ear, 0] = np.exp(cepstra[ear, 0])
-    for n in range(count - 1):
-        left, right = load_broadcast(h, n), load_broadcast(h, count + n)
-        for k in range(1, count - n, 8):
-            store(s, n + k, multiply_add(left, load(c, k), load(s, n + k)))
-            store(s, width + n + k, multiply_add(right, load(c, width + k), load(s, width + n + k)))
+        sums[ear, 0] = np.exp(cepstra[ear, 0])
+    for begin in range(0, whole, 8):
+        for ear in range(2):  # the chains of both ears are computed side by side
+            _find_eight(cepstra[ear], reciprocals[begin:], sums[ear, begin:], taps[ear, begin:])
         for ear in range(2):
-            taps[ear, n + 1] = sums[ear, n + 1] * reciprocals[n + 1]
+            _add_eight(cepstra[ear], taps[ear, begin:], sums[ear, begin:], count - begin)
+    for n in range(whole, count):
+        for ear in range(2):
+            for k in range(whole, n):
+                sums[ear, n] += cepstra[ear, n - k] * taps[ear, k]
+            taps[ear, n] = sums[ear, n] * reciprocals[n]
+
+
+@compiled_in_place
+def _find_eight(c: FloatArray, r: FloatArray, s: FloatArray, h: FloatArray) -> None:
+    """Find eight taps h from the sums s over all before them."""
+    h0 = s[0] * r[0]
+    h1 = (s[1] + c[1] * h0) * r[1]
+    h2 = (s[2] + c[2] * h0 + c[1] * h1) * r[2]
+    h3 = (s[3] + c[3] * h0 + c[2] * h1 + c[1] * h2) * r[3]
+    h4 = (s[4] + c[4] * h0 + c[3] * h1 + c[2] * h2 + c[1] * h3) * r[4]
+    h5 = (s[5] + c[5] * h0 + c[4] * h1 + c[3] * h2 + c[2] * h3 + c[1] * h4) * r[5]
+    h6 = (s[6] + c[6] * h0 + c[5] * h1 + c[4] * h2 + c[3] * h3 + c[2] * h4 + c[1] * h5) * r[6]
+    h7 = (s[7] + c[7] * h0 + c[6] * h1 + c[5] * h2 + c[4] * h3 + c[3] * h4 + c[2] * h5 + c[1] * h6) * r[7]
+    h[0], h[1], h[2], h[3] = h0, h1, h2, h3
+    h[4], h[5], h[6], h[7] = h4, h5, h6, h7
+
+
+@compiled_in_place
+def _add_eight(c: FloatArray, h: FloatArray, s: FloatArray, count: int) -> None:
+    """Add what eight taps h are worth to the sums s of the taps after them, up to the next whole vector after
+    `count`."""
+    taps, cepstrum, sums = h.ctypes.data, c.ctypes.data, s.ctypes.data
+    h0, h1, h2, h3 = load_broadcast(taps, 0), load_broadcast(taps, 1), load_broadcast(taps, 2), load_broadcast(taps, 3)
+    h4, h5, h6, h7 = load_broadcast(taps, 4), load_broadcast(taps, 5), load_broadcast(taps, 6), load_broadcast(taps, 7)
+    for n in range(8, count, 8):
+        total = multiply_add(h0, load(cepstrum, n), load(sums, n))
+        total = multiply_add(h1, load(cepstrum, n - 1), total)
+        total = multiply_add(h2, load(cepstrum, n - 2), total)
+        total = multiply_add(h3, load(cepstrum, n - 3), total)
+        total = multiply_add(h4, load(cepstrum, n - 4), total)
+        total = multiply_add(h5, load(cepstrum, n - 5), total)
+        total = multiply_add(h6, load(cepstrum, n - 6), total)
+        total = multiply_add(h7, load(cepstrum, n - 7), total)
+        store(sums, n, total)
 
 
 @compiled_in_place
