@@ -161,6 +161,7 @@ def create_app(
                 peers=peers,
                 access=access,
                 refused_requests=refused,
+                stores={name: each.calls for name, each in (("bundles", store), ("clips", clips)) if each is not None},
             )
             if settings.realtime:
                 become_prompt()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
-from server.core.stores import Store
+from server.core.stores import Store, StoreCalls
 from server.scene.bundle import MANIFEST_FILE, MOST_FILE_BYTES, MOST_MANIFEST_BYTES
 
 _logger = logging.getLogger(__name__)
@@ -73,6 +73,11 @@ class BundleStore:
     def name(self) -> str:
         """The store's address without a password."""
         return self._store.name
+
+    @property
+    def calls(self) -> StoreCalls:
+        """What the store was asked, and how it answered."""
+        return self._store.calls
 
     def fetch(self) -> None:
         """Copy what is new or has changed, and remove what has gone. If the store cannot be read, all stays as it
@@ -152,4 +157,5 @@ class BundleStore:
             return
         self._store.get(file.path, str(target))
         if target.stat().st_size != file.size_bytes:
+            self.calls.fail("read", "incomplete")
             raise _StoreError(f"{name} has {target.stat().st_size} bytes in place of {file.size_bytes}")

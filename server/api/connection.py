@@ -53,6 +53,7 @@ from server.assets.clip_store import ClipStore, is_upload
 from server.assets.clips import ClipLibrary, DecodeError
 from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.core.errors import RequestError
+from server.core.stores import StoreCalls
 from server.field.fields_by_level import FieldsByLevel
 from server.planning.cost import Costs
 from server.planning.places import place_of
@@ -289,6 +290,8 @@ class StreamHost:
     """Costs of rendering by scene and sample rate, and quality level, once they are measured."""
     refused_bundles: int = 0
     """Bundles of the folder that is watched which cannot be loaded."""
+    stores: Mapping[str, StoreCalls] = dataclasses.field(default_factory=dict)
+    """Calls of the stores of bundles and of clips, of those that there are."""
     refused_requests: RefusedRequests = dataclasses.field(default_factory=RefusedRequests)
     """Counts of requests that were refused because of who asked."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
@@ -551,7 +554,7 @@ class Connection:
             return self._draining()
 
     def _draining(self) -> Goodbye:
-        """What a client is told during the shutdown: how long it lasts, and how to go on."""
+        """What a client is told during the shutdown: when and how to go on."""
         seconds = self._host.readiness.drain.streams_retry_after_s
         how = "open the stream again" if self._parting is None else "resume with the snapshot"
         where = "another takes it now" if seconds is None else f"at another or here in {seconds} s"

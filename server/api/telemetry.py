@@ -20,6 +20,7 @@ from server.api.request_log import RefusedRequests
 from server.api.stream_counts import StreamLedger, StreamTotals
 from server.assets.clips import ClipLibrary
 from server.core.durations import DurationHistogram
+from server.core.stores import StoreCalls
 from server.runtime.readiness import Readiness
 from server.runtime.thread_watch import ThreadWatch
 from server.streaming.admission import Admission
@@ -52,6 +53,9 @@ class Host(Protocol):
 
     @property
     def refused_bundles(self) -> int: ...
+
+    @property
+    def stores(self) -> Mapping[str, StoreCalls]: ...
 
     @property
     def refused_requests(self) -> RefusedRequests: ...
@@ -115,6 +119,7 @@ class ServerCollector(Collector):
             "Scene bundles of `bundle_folder` that cannot be loaded; the log says why.",
             value=self._host.refused_bundles,
         )
+        yield from _stores(self._host.stores)
 
     def _audio_threads(self) -> Iterator[Metric]:
         streams = GaugeMetricFamily("nafir_audio_thread_streams", "Open streams of an audio thread.", labels=["thread"])
@@ -276,6 +281,32 @@ def _kept(streams: KeptStreams) -> Iterator[Metric]:
     yield outcomes
 
 
+def _stores(stores: Mapping[str, StoreCalls]) -> Iterator[Metric]:
+    times = HistogramMetricFamily(
+        "nafir_store_call_seconds",
+        "Time of a call of the store of `bundle_url` (bundles) or `clips_url` (clips), whether or not it succeeds.",
+        labels=["store", "operation"],
+    )
+    failures = CounterMetricFamily(
+        "nafir_store_failures",
+        "Calls of a store that raised an error, did not end in time (timeout), or left or brought a file of another "
+        "size (incomplete).",
+        labels=["store", "operation", "reason"],
+    )
+    answered = GaugeMetricFamily(
+        "nafir_store_last_answer_timestamp_seconds",
+        "When a call of a store last succeeded, in seconds since 1970; 0 before the first.",
+        labels=["store"],
+    )
+    for store, calls in stores.items():
+        answered.add_metric([store], calls.answered_s)
+        for operation, durations in calls.durations.items():
+            times.add_metric([store, operation], _buckets(durations), durations.total_s)
+        for (operation, reason), count in calls.failures.items():
+            failures.add_metric([store, operation, reason], count)
+    yield from (times, failures, answered)
+
+
 def _regrets(record: RegretRecord) -> Iterator[Metric]:
     yield CounterMetricFamily(
         "nafir_effect_checks", "Audits that compared a plan with a rendering of all effects.", value=record.checks
@@ -304,8 +335,10 @@ def exposition(collector: Collector) -> bytes:
 
 
 def _histogram(name: str, documentation: str, durations: DurationHistogram) -> Metric:
+    return HistogramMetricFamily(name, documentation, buckets=_buckets(durations), sum_value=durations.total_s)
+
+
+def _buckets(durations: DurationHistogram) -> list[tuple[str, float]]:
     counts = durations.cumulative()
-    buckets = [(f"{bound_s:.6g}", count) for bound_s, count in counts if _SHORTEST_S < bound_s < _LONGEST_S]
-    return HistogramMetricFamily(
-        name, documentation, buckets=[*buckets, ("+Inf", counts[-1][1])], sum_value=durations.total_s
-    )
+    buckets = [(f"{bound_s:.6g}", float(count)) for bound_s, count in counts if _SHORTEST_S < bound_s < _LONGEST_S]
+    return [*buckets, ("+Inf", float(counts[-1][1]))]

@@ -26,7 +26,7 @@ from weakref import WeakValueDictionary
 from server.assets.clip_store import MOST_CLIPS, ClipLabel, ClipStore, Incoming, is_upload, no_room, storing
 from server.assets.clips import Clip, UnknownClipError
 from server.core.errors import RequestError
-from server.core.stores import Store
+from server.core.stores import Failure, Operation, Store
 from server.runtime.bounded_calls import BoundedCalls
 
 T = TypeVar("T")
@@ -51,6 +51,7 @@ _LABELS_AT_ONCE: Final = 64
 _REMOVED_AT_ONCE: Final = 64
 _MOST_LABEL_BYTES: Final = 4_096
 _FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_DONE: Final[dict[Operation, str]] = {"list": "listed", "read": "read", "write": "written", "remove": "removed"}
 _STEM: Final = r"(?P<name>upload-[0-9a-f]{32})\.(?P<sound>(?P<stored>[0-9]{13})-[0-9a-f]{8})"
 _SOUND: Final = re.compile(rf"{_STEM}\.wav")
 _LABEL: Final = re.compile(rf"{_STEM}\.(?P<uploaded>[0-9]{{13}})\.json(?P<part>\.part)?")
@@ -164,7 +165,7 @@ class SharedClips:
         self._keeping: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._copying: dict[str, asyncio.Task[None]] = {}
         self._giving_up: set[asyncio.Task[None]] = set()
-        self._problems: dict[str, str] = {}
+        self._problems: dict[Operation, str] = {}
         """What fails now, by what the store cannot do."""
 
     async def run(self) -> None:
@@ -309,7 +310,7 @@ class SharedClips:
         began_s = self._began_s = loop.time()
         self._changed_meanwhile.clear()
         try:
-            files, clips = await self._call("listed", self._list_files)
+            files, clips = await self._call("list", self._list_files)
         except RequestError:
             self._is_down, self._failed_s = True, loop.time()
             raise
@@ -371,10 +372,10 @@ class SharedClips:
         self._arriving_bytes += size_bytes
         try:
             put = partial(self._store.put, str(incoming.target), self._store.path(clip.sound))
-            await self._call("written", put, size_bytes=size_bytes)
+            await self._call("write", put, size_bytes=size_bytes)
             # guard: what the store has not taken whole is not acknowledged
             if await self._call("read", partial(self._size_bytes, clip.sound)) != size_bytes:
-                self._tell("written", f"{clip.sound} did not come whole")
+                self._fail("write", "incomplete", f"{clip.sound} did not come whole")
                 raise _unreachable()
             self._note(clip.sound, size_bytes)
             await self._write(clip, label)
@@ -401,12 +402,12 @@ class SharedClips:
 
     async def _write(self, clip: SharedClip, label: ClipLabel) -> None:
         data = label.serialize()
-        await self._call("written", partial(self._store.write, self._store.path(clip.label), data))
+        await self._call("write", partial(self._store.write, self._store.path(clip.label), data))
         self._note(clip.label, len(data))
         self._labels[clip.label] = label
 
     async def _discard(self, file: str) -> None:
-        await self._call("removed", partial(self._store.remove, self._store.path(file)))
+        await self._call("remove", partial(self._store.remove, self._store.path(file)))
         self._note(file, None)
 
     async def _clean_up(self) -> None:
@@ -480,7 +481,7 @@ class SharedClips:
                 return False
             # guard: half a sound is no copy
             if incoming.target.stat().st_size != size_bytes:
-                self._tell("read", f"{clip.sound} did not come whole")
+                self._fail("read", "incomplete", f"{clip.sound} did not come whole")
                 raise _unreachable()
             await asyncio.to_thread(self.copies.keep_copy, clip.name, incoming, label, clip.uploaded_s)
         finally:
@@ -499,29 +500,34 @@ class SharedClips:
         if not task.cancelled():
             task.exception()  # nobody may wait for it any more
 
-    async def _call(self, what: str, work: Callable[[], T], *, size_bytes: int = 0) -> T:
+    async def _call(self, operation: Operation, work: Callable[[], T], *, size_bytes: int = 0) -> T:
         """Call the store, and log what fails once. Raises RequestError store_unreachable, or storage_failed if a disk
         is full."""
         limit_s = self._call_s + size_bytes / _BYTES_PER_S
         try:
             result = await self._calls.run(work, limit_s)
         except TimeoutError:
-            self._tell(what, f"it has not answered for {limit_s:.3g} s")
+            self._fail(operation, "timeout", f"it has not answered for {limit_s:.3g} s")
         except Exception as exc:  # noqa: BLE001  each file system raises errors of its own
-            self._tell(what, self._store.told(exc))
+            self._tell(operation, self._store.told(exc))
             if isinstance(exc, OSError) and exc.errno in _FULL:
                 with storing():
                     raise OSError(exc.errno, "") from None
         else:
-            if self._problems.pop(what, None) is not None:
-                _logger.info("clips of %s: can be %s again", self._store.name, what)
+            if self._problems.pop(operation, None) is not None:
+                _logger.info("clips of %s: can be %s again", self._store.name, _DONE[operation])
             return result
         raise _unreachable()
 
-    def _tell(self, what: str, problem: str) -> None:
-        if self._problems.get(what) != problem:
-            _logger.error("clips of %s: cannot be %s: %s", self._store.name, what, problem)
-        self._problems[what] = problem
+    def _fail(self, operation: Operation, how: Failure, problem: str) -> None:
+        """Count and tell a failure of which the store has raised no error."""
+        self._store.calls.fail(operation, how)
+        self._tell(operation, problem)
+
+    def _tell(self, operation: Operation, problem: str) -> None:
+        if self._problems.get(operation) != problem:
+            _logger.error("clips of %s: cannot be %s: %s", self._store.name, _DONE[operation], problem)
+        self._problems[operation] = problem
 
 
 def _unreachable() -> RequestError:

@@ -134,6 +134,7 @@ def test_a_store_that_cannot_be_read_leaves_all_as_it_was(bundle, url, monkeypat
             store.fetch()
         assert copied(store) == {"hall": set(bundle.contents)}
         assert caplog.text.count("no longer") == 1
+        assert store.calls.failures["list", "error"] == 2
         store.fetch()
         assert copied(store) == {"hall": set(bundle.contents)}
 

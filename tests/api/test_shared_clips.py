@@ -1,5 +1,6 @@
 """Two servers whose uploaded clips are in one store."""
 
+import re
 import sys
 import time
 
@@ -186,6 +187,11 @@ def test_a_store_that_is_lost_is_told_with_a_time_to_come_back(servers, monkeypa
             assert answer.headers["retry-after"] == "5"
         assert "games/clips" in caplog.text
         assert "unplugged" in caplog.text
+        failed = re.search(
+            r'nafir_store_failures_total{operation="list",reason="error",store="clips"} ([0-9.]+)',
+            two.get("/metrics").text,
+        )
+        assert float(failed[1]) > 0
         assert two.get("/v1/clips/trumpet").status_code == 200
         assert two.get("/readyz").status_code == 200
         end_s = time.monotonic() + 30

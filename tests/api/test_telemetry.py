@@ -10,6 +10,7 @@ from server.api.request_log import RefusedRequests
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector, exposition
 from server.core.durations import DurationHistogram
+from server.core.stores import StoreCalls
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.client_messages import PROTOCOL, AddEmitter, Hello
 from server.runtime.drain import Drain
@@ -34,6 +35,7 @@ class Host:
     def __init__(self, audio, offers):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
         self.refused_bundles = 0
+        self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
         self.ledger = StreamLedger()
         self.admission = Admission(audio, most_streams=1, cores=2)
@@ -181,6 +183,38 @@ def test_refused_callers_are_counted_by_code_and_nothing_else_makes_a_label(host
     assert told.keys() == before.keys()
     counted = {dict(key[1:])["status"] + dict(key[1:])["reason"]: told[key] for key in refused if told[key]}
     assert counted == {"401key_refused": 1, "401other": 1, "429other": 1}
+
+
+def test_calls_of_stores_are_told_by_what_was_asked_and_how_it_failed(host):
+    calls = host.stores["clips"] = StoreCalls(time_s=lambda: 1_000.0, clock_s=iter((0.0, 0.5, 1.0, 4.0)).__next__)
+    with pytest.raises(OSError, match="lost"), calls.call("write"):
+        raise OSError("lost")
+    silent = samples(host)
+    with pytest.raises(FileNotFoundError), calls.call("write"):
+        raise FileNotFoundError
+    calls.fail("list", "timeout")
+    told = samples(host)
+    of_clips = ("store", "clips")
+    writes = (("operation", "write"), of_clips)
+    assert silent["nafir_store_last_answer_timestamp_seconds", of_clips] == 0
+    assert told["nafir_store_last_answer_timestamp_seconds", of_clips] == 1_000
+    assert told["nafir_store_call_seconds_count", *writes] == 2
+    assert told["nafir_store_call_seconds_sum", *writes] == 3.5
+    below = {
+        dict(labels)["le"]: value
+        for (name, *labels), value in told.items()
+        if name == "nafir_store_call_seconds_bucket" and ("operation", "write") in labels
+    }
+    assert sorted(set(below.values())) == [0, 1, 2]
+    failures = {
+        tuple(labels): value
+        for (name, *labels), value in told.items()
+        if name == "nafir_store_failures_total" and value
+    }
+    assert failures == {
+        (("operation", "write"), ("reason", "error"), of_clips): 1,
+        (("operation", "list"), ("reason", "timeout"), of_clips): 1,
+    }
 
 
 def test_a_clock_that_is_set_does_not_look_like_a_restart(host, monkeypatch):

@@ -36,12 +36,12 @@ class FaultyStore(Store):
 
     def __init__(self, url):
         super().__init__(url, "clips_url")
-        self.errors, self.stalled, self.release, self.calls = {}, set(), threading.Event(), []
+        self.errors, self.stalled, self.release, self.asked = {}, set(), threading.Event(), []
 
 
 def _faulty(method):
     def call(self, *args):
-        self.calls.append(method)
+        self.asked.append(method)
         if method in self.stalled:
             self.release.wait(30)
         if (error := self.errors.get(method)) is not None:
@@ -142,7 +142,7 @@ def test_a_machine_that_is_lost_loses_no_clip_and_one_that_restarts_copies_none_
         shared = machine(name)
         await shared.bring(clip.name)
         assert samples(shared, clip.name) == 12_000
-        return shared._store.calls.count("get")
+        return shared._store.asked.count("get")
 
     clip = asyncio.run(first())
     assert asyncio.run(again("one")) == 0
@@ -171,7 +171,7 @@ def test_the_same_file_at_once_at_one_machine_is_stored_once(machine):
         one = machine()
         kept = await asyncio.gather(*(put(one) for _ in range(4)))
         assert [is_new for _, is_new in kept].count(True) == 1
-        assert one._store.calls.count("put") == 1
+        assert one._store.asked.count("put") == 1
 
     asyncio.run(scenario())
 
@@ -185,13 +185,13 @@ def test_uploading_again_keeps_the_title_and_the_sound_and_expires_later(machine
         again, is_new = await put(one, title="Another title")
         assert (again.title, is_new) == ("A clip", False)
         assert again.expires_at > clip.expires_at
-        assert one._store.calls.count("put") == 1
+        assert one._store.asked.count("put") == 1
         assert len(stored(url)) == 2
         clock.now_s += 3_000
         await two.look()
         await two.bring(clip.name)
         assert samples(two, clip.name) == 12_000
-        assert two._store.calls.count("get") == 1
+        assert two._store.asked.count("get") == 1
 
     asyncio.run(scenario())
 
@@ -203,7 +203,7 @@ def test_a_clip_that_is_about_to_expire_is_stored_anew(machine, url, clock):
         clock.now_s += EXPIRES_S - 60
         clip, is_new = await put(one, title="Another title")
         assert (clip.title, is_new) == ("A clip", False)
-        assert one._store.calls.count("put") == 2
+        assert one._store.asked.count("put") == 2
         clock.now_s += 60
         await one._clean_up()
         assert len(stored(url)) == 2
@@ -344,6 +344,8 @@ def test_a_store_that_does_not_answer_is_told_in_time(machine, caplog, use, meth
             await (two.clips() if use == "clips" else getattr(two, use)(clip.name))
         assert (caught.value.code, caught.value.status) == ("store_unreachable", 503)
         assert time.monotonic() - begun_s < 5
+        operation = {"get": "read"}.get(method, method)
+        assert two._store.calls.failures[operation, "timeout"] == (how == "stalls")
         assert not two._has_copy(clip.name)
         two._store.errors.clear()
         two._store.stalled.clear()
@@ -369,7 +371,7 @@ def test_while_the_store_is_lost_copies_play_and_all_else_is_refused_at_once(mac
             with pytest.raises(RequestError):
                 await two.look()
         assert caplog.text.count("unplugged") == 1
-        calls = len(two._store.calls)
+        calls = len(two._store.asked)
         await two.bring(clip.name)
         assert samples(two, clip.name) == 12_000
         assert await two.clips() == both
@@ -378,7 +380,7 @@ def test_while_the_store_is_lost_copies_play_and_all_else_is_refused_at_once(mac
             with pytest.raises(RequestError) as caught:
                 await use()
             assert caught.value.code == "store_unreachable"
-        assert len(two._store.calls) == calls
+        assert len(two._store.asked) == calls
         two._store.errors.clear()
         with caplog.at_level(logging.INFO):
             await two.look()
@@ -421,7 +423,7 @@ def test_a_machine_that_is_killed_between_sound_and_label_leaves_nothing_that_is
         one._store.stalled.add("write")
         putting = asyncio.create_task(put(one))
         async with asyncio.timeout(30):
-            while "write" not in one._store.calls:  # noqa: ASYNC110
+            while "write" not in one._store.asked:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
         putting.cancel()
 
@@ -461,6 +463,7 @@ def test_half_a_sound_is_neither_acknowledged_nor_played(machine, url, monkeypat
             with pytest.raises(RequestError) as caught:
                 await put(one)
             assert caught.value.code == "store_unreachable"
+        assert one._store.calls.failures["write", "incomplete"] == 1
         assert await two.clips() == []
         clip, _ = await put(one)
         with monkeypatch.context() as patch:
@@ -469,6 +472,7 @@ def test_half_a_sound_is_neither_acknowledged_nor_played(machine, url, monkeypat
                 await two.bring(clip.name)
             assert caught.value.code == "store_unreachable"
             assert not two._has_copy(clip.name)
+        assert two._store.calls.failures["read", "incomplete"] == 1
         await two.bring(clip.name)
 
     asyncio.run(scenario())
@@ -554,7 +558,7 @@ def test_no_other_name_becomes_a_path(machine, name):
         for use in (one.describe, one.bring, one.remove):
             with pytest.raises(UnknownClipError):
                 await use(name)
-        assert one._store.calls == []
+        assert one._store.asked == []
 
     asyncio.run(scenario())
 
@@ -565,7 +569,7 @@ def test_many_who_ask_for_what_there_is_not_share_a_listing(machine):
         names = [f"upload-{number:032x}" for number in range(50)]
         found = await asyncio.gather(*map(one.bring, names), return_exceptions=True)
         assert all(isinstance(each, UnknownClipError) for each in found)
-        assert len(one._store.calls) <= 2
+        assert len(one._store.asked) <= 2
 
     asyncio.run(scenario())
 
@@ -575,7 +579,7 @@ def test_many_who_ask_for_a_clip_share_a_copy(machine):
         one, two = machine("one"), machine("two")
         clip, _ = await put(one)
         await asyncio.gather(*(two.bring(clip.name) for _ in range(10)))
-        assert two._store.calls.count("get") == 1
+        assert two._store.asked.count("get") == 1
 
     asyncio.run(scenario())
 

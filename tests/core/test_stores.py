@@ -40,6 +40,47 @@ def test_files_come_and_go(store, tmp_path):
     assert [entry.name for entry in store.list()] == ["a.json"]
 
 
+def counted(store):
+    return {operation: durations.count for operation, durations in store.calls.durations.items()}
+
+
+def test_each_call_is_counted_by_what_was_asked(store, tmp_path):
+    (tmp_path / "here").write_bytes(b"sound")
+    store.put(str(tmp_path / "here"), store.path("a.wav"))
+    store.write(store.path("a.json"), b"label")
+    store.list()
+    store.key(store.path("a.wav"))
+    store.size_bytes(store.path("a.wav"))
+    store.read([store.path("a.json")], 3)
+    store.get(store.path("a.wav"), str(tmp_path / "there"))
+    for _ in range(2):
+        store.remove(store.path("a.wav"))
+    assert counted(store) == {"list": 1, "read": 4, "write": 2, "remove": 2}
+    assert not any(store.calls.failures.values())
+    assert store.calls.answered_s > 0
+
+
+def test_that_there_is_nothing_is_an_answer_and_an_error_is_none(store, monkeypatch):
+    with pytest.raises(FileNotFoundError):
+        store.size_bytes(store.path("none"))
+    assert not any(store.calls.failures.values())
+    answered_s = store.calls.answered_s
+    assert answered_s > 0
+
+    def fail(*_, **__):
+        raise PermissionError("refused")
+
+    for method in ("ls", "pipe_file", "rm_file", "info"):
+        monkeypatch.setattr(type(store._system), method, fail)
+    for call in (store.list, lambda: store.write("x", b""), lambda: store.remove("x"), lambda: store.size_bytes("x")):
+        with pytest.raises(PermissionError):
+            call()
+    monkeypatch.setattr(type(store._system), "cat_ranges", lambda *_, **__: [b"label", PermissionError("refused")])
+    store.read(["x", "y"], 3)
+    failures = {key: count for key, count in store.calls.failures.items() if count}
+    assert failures == {("list", "error"): 1, ("write", "error"): 1, ("remove", "error"): 1, ("read", "error"): 2}
+
+
 def test_where_files_can_be_renamed_none_is_seen_before_it_is_whole(tmp_path, monkeypatch):
     (tmp_path / "clips").mkdir()
     store = Store(f"file://{tmp_path}/clips", "clips_url")

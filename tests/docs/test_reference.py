@@ -18,6 +18,7 @@ from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector
 from server.cli.main import app as nafir
+from server.core.stores import StoreCalls
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
 from server.protocol.exchange import EXCHANGE
 from server.runtime.drain import Drain
@@ -144,6 +145,7 @@ class Host:
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}
         self.refused_bundles = 0
+        self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
 
 
