@@ -238,6 +238,7 @@ class SharedClips:
             if there is not None and label is not None and (clip := await self._renewed(there, label)) is not None:
                 await asyncio.to_thread(self.copies.renew, name, clip.uploaded_s)
                 return self._described(clip, label), False
+            is_new = label is None or self._current(name) is None  # it may have been removed elsewhere
             label = label or ClipLabel(title, duration_s)
             former = self._clips.get(name)
             now_ms = max(_ms(self._time_s()), 0 if former is None else former.uploaded_ms + 1)
@@ -247,7 +248,7 @@ class SharedClips:
                 await asyncio.to_thread(self.copies.keep_copy, name, incoming, label, clip.uploaded_s)
             except RequestError as exc:  # the clip is safe, and is copied when it is asked for
                 _logger.warning("an uploaded clip is not copied: %s", exc)
-            return self._described(clip, label), there is None
+            return self._described(clip, label), is_new
 
     async def remove(self, name: str) -> None:
         """Remove a clip from the store; what plays it goes on, and other machines know it no longer with their next

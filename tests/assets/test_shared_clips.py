@@ -250,6 +250,22 @@ def test_what_is_deleted_is_gone_from_the_store_and_from_others(machine, url):
     asyncio.run(scenario())
 
 
+@pytest.mark.parametrize("has_asked", [False, True])
+def test_what_was_deleted_elsewhere_is_new_when_it_is_uploaded_again(machine, clock, has_asked):
+    async def scenario():
+        one, two = machine("one"), machine("two")
+        clip, _ = await put(one)
+        await two.look()
+        await two.remove(clip.name)
+        if not has_asked:
+            one._labels.clear()  # as one that has not read the label yet
+        clock.now_s += 1
+        _, is_new = await put(one)
+        assert is_new
+
+    asyncio.run(scenario())
+
+
 def test_a_quota_counts_what_all_machines_have_stored(machine, url, clock):
     async def scenario():
         one, two = machine("one"), machine("two")
