@@ -16,6 +16,9 @@ _FOR_ANSWERS = 0.85
 """Share of the drain time after which the server stops waiting for clients to read those answers."""
 _FOR_STREAMS = 0.5
 """Share of the drain time in which streams end one after the other, where others take them."""
+_STREAMS_COME_BACK_S = 1
+"""When streams that have ended at once may come back. Another server takes them by then, and this one has ended unless
+a request is in flight. If it is not back yet, the attempt costs little, and clients make each later than the last."""
 
 
 class Drain:
@@ -47,8 +50,8 @@ class Drain:
 
     @property
     def streams_retry_after_s(self) -> int | None:
-        """The same for streams; None if others take them at once."""
-        return None if self._spread_s else self.retry_after_s
+        """Whole seconds until a stream that was told may come back; None if others take it at once."""
+        return None if self._spread_s else _STREAMS_COME_BACK_S
 
     def begin(self) -> None:
         """Accept nothing new from now on. A second call changes nothing."""

@@ -100,8 +100,8 @@ def test_where_others_take_them_streams_end_one_after_the_other_in_half_of_the_t
     assert turns_s == sorted(turns_s)
 
 
-def test_streams_are_told_to_wait_for_a_server_that_comes_back_and_not_for_others():
-    assert Drain(8.0).streams_retry_after_s == 8
+def test_streams_are_told_to_come_back_soon_and_where_others_take_them_at_once():
+    assert Drain(8.0).streams_retry_after_s == 1
     assert Drain(8.0, in_turn=True).streams_retry_after_s is None
     assert Drain(8.0, in_turn=True).retry_after_s == 8
 
