@@ -10,17 +10,19 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.decoding_kernel import silence
 from server.field.band_tail_kernel import balance
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
     LANES,
+    WIDE_LANES,
     add,
     at_least,
     broadcast,
     choose_below,
     divide,
+    lanes,
     load,
-    load_shorts,
     multiply,
     multiply_add,
     multiply_subtract,
@@ -33,10 +35,13 @@ Float32 = npt.NDArray[np.float32]
 Int16 = npt.NDArray[np.int16]
 Floats = npt.NDArray[np.float64]
 
+_wide = lanes(WIDE_LANES)
+_load_wide, _load_shorts, _all_wide, _wide_of = _wide.load, _wide.load_shorts, _wide.load_broadcast, _wide.broadcast
 _SWEEPS = 5
 _TINY = np.float32(1e-20)
-_AT_ONCE = 1024
-_RAMP = np.arange(LANES, dtype=np.float32)
+_GROUP = 4
+"""Channels whose sums are in registers at once. Responses have 1, 4, 9 or 16, so their last group has one or all."""
+_RAMP = np.arange(WIDE_LANES, dtype=np.float32)
 _ROOT_THIRD = np.float32(1 / math.sqrt(3.0))
 
 
@@ -195,11 +200,37 @@ def mix_bands(
 
     `log_magnitude` (band, column) is what an ideal omnidirectional microphone hears, and `mixing` (k, noise, band,
     column) makes channels of unit power from the `noises` (noise, band, sample), whose units are `steps` (noise, band).
-    `mixing` is overwritten with the gains of the noises. Gains hold at the samples `places` (column,), and are
-    interpolated between them. Before the first place, they rise from zero at sample `begin`, as the level does in a
-    first frame, whose window overlaps with none before it.
+    Gains hold at the samples `places` (column,), and are interpolated between them. Before the first place, they rise
+    from zero at sample `begin`, as the level does in a first frame, whose window overlaps with none before it.
     """
-    channels, bands, columns = response.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
+    gains = _gains_of(log_magnitude, mixing, log_floor, steps)
+    silent, lines = np.zeros_like(gains[0]), np.empty((*gains.shape[1:3], 2 * _GROUP), np.float32)
+    last, size = gains.shape[0] - 1, response.shape[1]
+    end = min(size, noises.shape[2])
+    at, column = max(0, begin), -1
+    silence(response, 0, min(at, size))
+    while at < end:
+        while column < last and places[column + 1] <= at:
+            column += 1
+        stop = end if column == last else min(end, math.ceil(places[column + 1]))
+        low, high = max(column, 0), min(column + 1, last)
+        since = places[low] if column >= 0 else begin
+        apart = places[high] - since
+        share = (at - since) / apart if apart > 0 else 0.0
+        step = 1.0 / apart if apart > 0 else 0.0
+        _find_lines(gains[low] if column >= 0 else silent, gains[high], np.float32(share), np.float32(step), lines)
+        for group in range(lines.shape[0]):
+            _write_group(lines[group], noises, at, stop, response[_GROUP * group :])
+        at = stop
+    silence(response, max(at, end), size)
+
+
+@compiled
+def _gains_of(log_magnitude, mixing, log_floor, steps):
+    """(column, group, band and noise, _GROUP) the gains of the noises in groups of channels; zeros for channels that a
+    group lacks."""
+    channels, bands, columns = mixing.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
+    gains = np.zeros((columns, (channels + _GROUP - 1) // _GROUP, bands * channels, _GROUP), np.float32)
     for column in range(columns):
         before = magnitude = _magnitude(log_magnitude[0, column], log_floor)
         for band in range(bands):
@@ -208,32 +239,9 @@ def mix_bands(
             before, magnitude = magnitude, after
             for i in range(channels):
                 for j in range(channels):
-                    mixing[i, j, band, column] *= gain * steps[j, band]
-    for channel in range(channels):
-        for n in range(response.shape[1]):
-            response[channel, n] = 0
-    last, end = columns - 1, min(response.shape[1], noises.shape[2])
-    at, column = max(0, begin), -1
-    while at < end:
-        while column < last and places[column + 1] <= at:
-            column += 1
-        stop = end if column == last else min(end, math.ceil(places[column + 1]))
-        stop = min(stop, at + _AT_ONCE)
-        low, high = max(column, 0), min(column + 1, last)
-        since = places[low] if column >= 0 else begin
-        apart = places[high] - since
-        share = (at - since) / apart if apart > 0 else 0.0
-        step = 1.0 / apart if apart > 0 else 0.0
-        for band in range(bands):
-            for i in range(channels):
-                # The first channel has a noise alone.
-                for j in range(channels if i > 0 else 1):
-                    before, after = mixing[i, j, band, low], mixing[i, j, band, high]
-                    if column < 0:
-                        before = np.float32(0.0)
-                    first, slope = np.float32(before + (after - before) * share), np.float32((after - before) * step)
-                    _add(first, slope, noises[j, band], response[i], at, stop)
-        at = stop
+                    of_noise = gain * steps[j, band] * mixing[i, j, band, column]
+                    gains[column, i // _GROUP, band * channels + j, i % _GROUP] = of_noise
+    return gains
 
 
 @compiled
@@ -242,13 +250,55 @@ def _magnitude(log_magnitude, log_floor):
 
 
 @compiled
-def _add(first, slope, noise, out, at, stop) -> None:
-    """Add samples `at` to `stop` of a noise, with a gain that begins with `first` and changes by `slope` per sample."""
-    source, to, count = noise.ctypes.data + 2 * at, out.ctypes.data + 4 * at, stop - at
-    vectors = count // LANES * LANES
-    gain, step = multiply_add(load(_RAMP.ctypes.data, 0), broadcast(slope), broadcast(first)), broadcast(slope * LANES)
-    for n in range(0, vectors, LANES):
-        store(to, n, multiply_add(gain, load_shorts(source, n), load(to, n)))
-        gain = add(gain, step)
+def _find_lines(before, after, share, step, lines) -> None:
+    """Write how gains (group, band and noise, _GROUP) go from one place to the next: their values a `share` of the way
+    on, then their slopes per sample."""
+    for group in range(lines.shape[0]):
+        for number in range(lines.shape[1]):
+            for i in range(_GROUP):
+                rise = after[group, number, i] - before[group, number, i]
+                lines[group, number, i] = before[group, number, i] + rise * share
+                lines[group, number, _GROUP + i] = rise * step
+
+
+@compiled
+def _write_group(lines, noises, at, stop, response) -> None:
+    """Write samples `at` to `stop` of the first channels of a response, at most _GROUP, from the noises along `lines`
+    (band and noise, 2 _GROUP). Sums over bands and noises stay in registers."""
+    channels, bands = noises.shape[0], noises.shape[1]
+    by_noise, by_band = noises.strides[0], noises.strides[1]
+    source, to, row = noises.ctypes.data + 2 * at, response.ctypes.data + 4 * at, response.strides[0] // 4
+    values, ramp, nothing = lines.ctypes.data, _load_wide(_RAMP.ctypes.data, 0), _wide_of(np.float32(0.0))
+    count, written = stop - at, min(_GROUP, response.shape[0])
+    vectors = count // WIDE_LANES * WIDE_LANES
+    for n in range(0, vectors, WIDE_LANES):
+        x = add(ramp, _wide_of(np.float32(n)))
+        first, second, third, fourth = nothing, nothing, nothing, nothing
+        line = 0
+        for band in range(bands):
+            for j in range(channels):
+                noise = _load_shorts(source + j * by_noise + band * by_band, n)
+                first = multiply_add(_on(values, line, x), noise, first)
+                second = multiply_add(_on(values, line + 1, x), noise, second)
+                third = multiply_add(_on(values, line + 2, x), noise, third)
+                fourth = multiply_add(_on(values, line + 3, x), noise, fourth)
+                line += 2 * _GROUP
+        store(to, n, first)
+        if written == _GROUP:
+            store(to, row + n, second)
+            store(to, 2 * row + n, third)
+            store(to, 3 * row + n, fourth)
     for n in range(vectors, count):
-        out[at + n] += (first + slope * np.float32(n)) * np.float32(noise[at + n])
+        for i in range(written):
+            total = np.float32(0.0)
+            for band in range(bands):
+                for j in range(channels):
+                    line = lines[band * channels + j]
+                    total += (line[i] + line[_GROUP + i] * np.float32(n)) * np.float32(noises[j, band, at + n])
+            response[i, at + n] = total
+
+
+@compiled
+def _on(lines, at, x):
+    """The gain at samples x of the line at `at`."""
+    return multiply_add(x, _all_wide(lines, at + _GROUP), _all_wide(lines, at))

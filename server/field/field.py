@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,9 @@ from server.kernels.energy import first_not_finite
 from server.rendering.hrtf import HeadFilters
 from server.scene.bundle import Bundle
 from server.scene.manifest import Phase, QualityLevel
+
+if TYPE_CHECKING:
+    from server.field.ambisonic_decoder import AmbisonicDecoder
 
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -265,6 +268,12 @@ class AcousticField:
         return (self._surroundings or self.bundle.surroundings).first_echo()
 
     @cached_property
+    def _ambisonic_decoder(self) -> "AmbisonicDecoder":
+        from server.field.ambisonic_decoder import AmbisonicDecoder
+
+        return AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
+
+    @cached_property
     def _encoded(self) -> dict[int, "AcousticField"]:
         return {}
 
@@ -348,14 +357,11 @@ class AcousticField:
         return self._ambisonics(listeners, emitters, order)
 
     def _ambisonics(self, listeners: Floats, emitters: Floats, order: int) -> Float32:
-        from server.field.ambisonic_decoder import AmbisonicDecoder
-
         assert isinstance(self.graph, DirectionalGraph)
         paths = self._paths.describe(listeners, emitters)
         aligned, onsets, echoes = self._times(listeners, emitters, paths)
-        decoder = AmbisonicDecoder(self.graph.parameters, ir_samples=self.ir_samples, frames=self.level.frames)
         arrivals = self.graph.heard_arrivals(listeners, emitters, paths)
-        responses = self._finite(decoder.decode(arrivals, aligned, order), listeners, emitters)
+        responses = self._finite(self._ambisonic_decoder.decode(arrivals, aligned, order), listeners, emitters)
         for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
             # One gate for all channels, so that none changes its direction.
             response *= self._gate.gains(response[0], int(onset), int(echo)).astype(np.float32)
