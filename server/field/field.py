@@ -364,7 +364,8 @@ class AcousticField:
         responses = self._finite(self._ambisonic_decoder.decode(arrivals, aligned, order), listeners, emitters)
         for response, onset, echo in zip(responses, onsets, onsets if echoes is None else echoes, strict=True):
             # One gate for all channels, so that none changes its direction.
-            response *= self._gate.gains(response[0], int(onset), int(echo)).astype(np.float32)
+            gains = self._gate.gains(response[0], int(onset), int(echo)).astype(np.float32)
+            response[:, : len(gains)] *= gains
         return responses
 
     def snap(self, listener: Vector3, emitter: Vector3, yaw: float) -> Snapped:

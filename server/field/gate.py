@@ -51,19 +51,20 @@ class Gate:
         self._open(responses, onsets, begins)
 
     def gains(self, reference: Float32, onset: int, echo: int) -> npt.NDArray[np.float64]:
-        """The factors (sample,) by which `open` multiplies one response (sample,), for others that are to keep their
-        proportions to it."""
+        """The factors by which `open` multiplies the first samples of one response (sample,), for others that are to
+        keep their proportions to it. Samples after the last factor stay as they are."""
         begin, size = echo - len(self._answer), len(reference)
-        gains = np.zeros(size)
         opens = max(0, onset, begin)
         if opens >= size:
-            return gains
-        gains[opens:] = 1.0
+            return np.zeros(size)
+        size = min(size, max(onset + len(self._rise), echo, opens + len(self._given)))
+        gains = np.ones(size)
+        gains[:opens] = 0
         for start, rise in ((onset, self._rise), (begin, self._answer)):
             first, last = max(opens, start), min(size, start + len(rise))
             if first < last:
                 gains[first:last] *= rise[first - start : last - start]
-        power = np.square(reference.astype(np.float64))
+        power = np.square(reference[:size].astype(np.float64))
         taken = float(np.sum(power * (1 - gains * gains)))
         given = self._given[: size - opens].astype(np.float64)
         until = opens + len(given)

@@ -126,7 +126,8 @@ def test_gains_for_other_channels_are_those_of_the_gate(onset, echo, after, give
     responses = _noise()[:1, :1].copy()
     responses[..., 300:] *= after
     gains = gate.gains(responses[0, 0], onset, echo)
-    expected = responses[0, 0] * gains
+    expected = responses[0, 0].copy()
+    expected[: len(gains)] *= gains
     assert np.isfinite(gains).all()
     gate.open(responses, np.array([onset]), np.array([echo]))
     assert_allclose(responses[0, 0], expected, rtol=1e-5, atol=1e-12)
