@@ -32,6 +32,7 @@ from server.protocol.server_messages import (
     Welcome,
     parse_server_message,
 )
+from server.runtime.workers import Workers
 from server.scene.effects import EffectName
 from tests.directional_flat import write_directional
 
@@ -538,6 +539,26 @@ def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client_of_
                     return
             time.sleep(0.02)
     raise AssertionError("no room for a new stream")
+
+
+def test_a_hello_whose_turn_to_begin_does_not_come_is_told_when_to_come_back(client_of_few, monkeypatch):
+    """While first responses of others wait for a worker, nobody else begins; its place is free again."""
+    admission = client_of_few.app_state["host"].admission
+    monkeypatch.setattr(Workers, "has_urgent", property(lambda _: True))
+    with client_of_few.websocket_connect("/v1/stream") as socket:
+        socket.send_text(HELLO.serialize())
+        refused = parse_server_message(socket.receive_text())
+        assert refused.code == "server_busy"
+        assert "too many streams begin" in refused.message
+        assert 1 <= refused.retry_after_s <= 60
+        with pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_text()
+        assert closed.value.code == 1013
+    assert admission.streams == 0
+    assert admission.refusals["hello", "opening"] == 1
+    monkeypatch.setattr(Workers, "has_urgent", property(lambda _: False))
+    with client_of_few.websocket_connect("/v1/stream") as socket:
+        Ears(socket)
 
 
 def test_a_client_that_never_acknowledges_gets_a_window_and_then_nothing(client):
