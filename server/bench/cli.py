@@ -80,7 +80,7 @@ def field(
     """Time from a pose to a binaural impulse response, one at a time on one core, at every quality level.
 
     At the default level also until it is ready to be convolved: for a pose that moved, for a head that only turned, and
-    for ambisonic channels.
+    for ambisonic channels; and each part of the first by itself.
     """
     from server.bench.field import measure_levels
     from server.field.fields_by_level import FieldsByLevel

@@ -1,5 +1,5 @@
 """Time until a response of the default level is ready to be convolved, one at a time on one core: for a listener who
-moved, for one who only turned the head, and for ambisonic channels."""
+moved, for one who only turned the head, and for ambisonic channels; and how long each part of it takes by itself."""
 
 import statistics
 import time
@@ -19,14 +19,17 @@ from server.responses.ir_request import composed_irs
 from server.scene.manifest import NO_FIELD
 from server.streaming.calibration import Listener
 
-MOVED, TURNED, BY_BUS, AMBISONIC, PARTITIONS = (
+MOVED, TURNED, BY_BUS, AMBISONIC, NETWORK, FIELD, REFLECTIONS, PARTITIONS = (
     "moved",
     "only turned",
     "only turned, by a bus of order 1",
     "moved, ambisonics of order 1",
+    "moved, network alone",
+    "moved, field alone, network included",
+    "moved, first reflections alone",
     "moved, partitions alone",
 )
-"""Rows of the measurement. The last is part of the first."""
+"""Rows of the measurement. The last four are parts of the first."""
 
 _TURN_RAD = 0.5
 _BLOCK_SIZE = 256
@@ -82,7 +85,7 @@ def _ways(field: AcousticField, filters: HeadFilters) -> dict[str, _Timed]:
         by_bus = AcousticField(field.bundle, field.level.model_copy(update={"bus": 1}), field.graph)
         ambisonic = _listener(field, filters, order=1)
         ways |= {BY_BUS: _turned(Listener(by_bus, filters)), AMBISONIC: ambisonic.time_ms}
-    return ways | {PARTITIONS: _partitions(field, filters)}
+    return ways | _parts(field, filters)
 
 
 def _listener(field: AcousticField, filters: HeadFilters, order: int | None = None) -> Listener:
@@ -99,18 +102,35 @@ def _turned(listener: Listener) -> _Timed:
     return turned
 
 
-def _partitions(field: AcousticField, filters: HeadFilters) -> _Timed:
-    """The time from samples to partitions of the default block size."""
+def _parts(field: AcousticField, filters: HeadFilters) -> dict[str, _Timed]:
+    """The parts of a response, each by itself: what the network says, what the field makes of it, the first
+    reflections, if geometry has them, and the partitions of the default block size."""
     direct_sound = DirectSound.of(field.bundle, filters)
     renderer = direct_sound.renderer(
         block_size=_BLOCK_SIZE, ir_samples=field.ir_samples, sample_rate=field.sample_rate, max_emitters=1
     )
     emitter = EmitterState(Pose(field.bundle.manifest.start.emitter))
+    places, heard = [emitter.position], field.through(filters)
+
+    def network(pose: Pose) -> float:
+        return _ms(lambda: heard.graph.run([pose.position], places, [pose.orientation]))
+
+    def of_field(pose: Pose) -> float:
+        return _ms(lambda: heard.impulse_responses([pose.position], places, [pose.orientation]))
 
     def partitions(pose: Pose) -> float:
         (response,) = composed_irs(field, direct_sound, pose, [emitter])
-        started_s = time.perf_counter()
-        renderer.prepare(response)
-        return 1000 * (time.perf_counter() - started_s)
+        return _ms(lambda: renderer.prepare(response))
 
-    return partitions
+    parts: dict[str, _Timed] = {NETWORK: network, FIELD: of_field}
+    early = direct_sound.early_reflections
+    if early is not None:
+        responses = np.zeros((1, 2, field.ir_samples), np.float32)
+        parts[REFLECTIONS] = lambda pose: _ms(lambda: early.add(responses, pose, [emitter]))
+    return parts | {PARTITIONS: partitions}
+
+
+def _ms(work: Callable[[], object]) -> float:
+    started_s = time.perf_counter()
+    work()
+    return 1000 * (time.perf_counter() - started_s)
