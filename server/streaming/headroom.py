@@ -52,9 +52,9 @@ class Limits:
     most_opening_s: float = 0.05
     """Seconds that newcomers may still take to begin when the next one does. Their first IRs go before all others, and
     two periods of the load policy with long waits are one too many."""
-    most_turn_s: float = 0.5
+    most_turn_s: float = 0.35
     """Seconds after which a newcomer's turn to begin has to be expected. Who is refused is to know within a second."""
-    turn_patience_s: float = 0.6
+    turn_patience_s: float = 0.45
     """Seconds after which a newcomer is refused whose turn has not come."""
 
     poses_hz: float = 30.0
