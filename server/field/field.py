@@ -510,6 +510,7 @@ class AcousticField:
     def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
         """Return the responses unchanged. Raises FieldError naming the first that is not finite."""
         at = first_not_finite(responses)
+        # guard: responses that are not finite are handed to nobody
         if at >= 0:
             raise FieldError(
                 f"scene {self.bundle.id}: field {self.graph.name} has no finite response for listener "
