@@ -99,7 +99,7 @@ def test_a_tuple_in_a_tuple_has_its_fields(flag):
 
 
 @pytest.mark.parametrize("flag", [False, True])
-def test_the_value_of_a_reference_is_the_tuple_as_it_is_now(flag):
+def test_value_of_a_reference_is_the_tuple_as_it_is_now(flag):
     @numba.njit
     def take(nested, times):
         total = 0.0
