@@ -3,7 +3,7 @@
 ARG BASE=python:3.11-slim
 
 # The library of LLVM that compiles the kernels, for the processor of this machine alone: the one in llvmlite's package can
-# compile for some twenty kinds, and is three times as large. Sources are those of the lock file, LLVM is Debian's.
+# compile for some twenty kinds, and is three and a half times as large. Sources are those of the lock file, LLVM is Debian's.
 FROM ${BASE} AS llvm
 WORKDIR /source
 RUN apt-get update && apt-get install --yes --no-install-recommends llvm-22-dev cmake g++ make zlib1g-dev libzstd-dev
@@ -12,8 +12,23 @@ RUN cd /usr/lib/llvm-22 && target=$(bin/llvm-config --host-target | sed 's/^x86_
     && sed -i "/^LLVM_[A-Z_]*(/{/($target)/!d}" include/llvm/Config/*.def
 COPY requirements.lock ./
 RUN sed -n '/^llvmlite==/,/[^\\]$/p' requirements.lock > llvmlite.lock \
-    && LLVM_DIR=/usr/lib/llvm-22/lib/cmake/llvm LLVMLITE_LTO=OFF \
+    && LLVM_DIR=/usr/lib/llvm-22/lib/cmake/llvm LLVMLITE_LTO=OFF LDFLAGS='-Wl,--gc-sections -Wl,-z,pack-relative-relocs' \
         python3 -m pip wheel --no-deps --no-binary llvmlite --require-hashes --requirement llvmlite.lock --wheel-dir /wheels
+
+# NumPy with SciPy's OpenBLAS, so that there is one: in their packages each has its own, of 25 MB.
+FROM ${BASE} AS numpy
+WORKDIR /source
+RUN apt-get update && apt-get install --yes --no-install-recommends g++ pkgconf \
+    && { test -f "$(python3 -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h" \
+        || apt-get install --yes --no-install-recommends python3-dev; }
+COPY requirements.lock ./
+RUN for package in numpy scipy; do sed -n "/^$package==/,/[^\\]\$/p" requirements.lock > $package.lock; done \
+    && python3 -m pip install --no-deps --no-compile --require-hashes --requirement scipy.lock --target scipy \
+    && printf 'Name: scipy-openblas\nDescription: OpenBLAS\nVersion: 0.3\nLibs: -L%s -l:%s\nCflags: -DBLAS_SYMBOL_PREFIX=scipy_\n' \
+        /source/scipy/scipy.libs "$(basename scipy/scipy.libs/libscipy_openblas-*.so)" > scipy-openblas.pc \
+    && PKG_CONFIG_PATH=/source LD_LIBRARY_PATH=/source/scipy/scipy.libs LDFLAGS='-Wl,-rpath,$ORIGIN/../../scipy.libs' \
+        python3 -m pip wheel --no-deps --no-binary numpy --require-hashes --requirement numpy.lock --wheel-dir /wheels \
+            -Csetup-args=-Dblas=scipy-openblas -Csetup-args=-Dlapack=scipy-openblas
 
 FROM ${BASE} AS builder
 WORKDIR /source
@@ -24,13 +39,16 @@ RUN python -m venv --without-pip /opt/nafir
 # `make lock` writes the file of exact versions and of digests that each download has to have.
 COPY requirements.lock ./
 COPY --from=llvm /wheels /wheels
-# What no server runs is left out: tests, sources and headers for compilers, symbols for debuggers, ONNX Runtime's tools and
-# its second copy for C, and what Pillow has for other files than PNG. Libraries in `*.libs` were patched by their packagers, and stripping would break them.
+COPY --from=numpy /wheels /wheels
+# What no server runs is left out: tests and what is compiled for them, sources and headers for compilers, symbols for
+# debuggers, ONNX Runtime's tools and its second copy for C, and what Pillow has for other files than PNG. Libraries in `*.libs`
+# were patched by their packagers, and stripping would break them.
 RUN python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --require-hashes --requirement requirements.lock \
-    && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --no-deps --force-reinstall /wheels/llvmlite-*.whl \
+    && python -m pip --python /opt/nafir/bin/python install --no-cache-dir --no-compile --no-deps --force-reinstall /wheels/*.whl \
     && cd /opt/nafir/lib/python3*/site-packages \
     && find . -type d -name tests -prune -exec rm -rf {} + \
     && find . \( -name '*.pyi' -o -name '*.p[xy][dx]' -o -name '*.[ahcf]' -o -name '*.hpp' \) -delete \
+    && find numpy/_core \( -name '_*_tests.*.so' -o -name '_simd.*.so' \) -delete \
     && rm -rf onnxruntime/transformers onnxruntime/tools onnxruntime/quantization onnxruntime/datasets onnxruntime/backend \
     && rm -f onnxruntime/capi/libonnxruntime.so* PIL/_avif.*.so PIL/_webp.*.so PIL/_imagingft.*.so PIL/_imagingcms.*.so \
     && find . -name '*.so*' -not -path './*.libs/*' -exec strip --strip-unneeded {} +

@@ -274,3 +274,21 @@ def test_the_unit_is_one():
     )
     complaints = [line for line in ran.stderr.splitlines() if UNIT.name in line and "not executable" not in line]
     assert complaints == []
+
+
+@pytest.mark.parametrize(
+    ("bundled", "system"),
+    [
+        ("libcrypto-5d63cd29.so.3", "libcrypto.so.3"),
+        ("libbz2-a1e77c99.so.1.0.6", "libbz2.so.1.0"),
+        ("libzstd-3084d8a0.so.1.5.7", "libzstd.so.1"),
+        ("libssl-a140065d.so.1.1", None),  # another interface
+        ("libzstd-3084d8a0.so.10", None),
+        ("libscipy_openblas-6cdc3b4a.so", None),
+        ("libgfortran-8f1e9814.so.5.0.0", None),  # not known to be the same everywhere
+    ],
+)
+def test_libraries_of_packages_stand_back_for_those_of_the_base(bundled, system):
+    of_both = runpy.run_path(str(DEPLOY / "container" / "root.py"))["of_both"]
+    known = ["libcrypto.so.3", "libssl.so.3", "libbz2.so.1.0", "libzstd.so.1", "libgfortran.so.5"]
+    assert of_both(bundled, known) == system
