@@ -3,18 +3,22 @@ is trained on."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from server.acoustics.doors import MeshWithDoors, Openness
 from training.data.levels.level_scene import LevelScene
 from training.data.simulated_scene import SimulatedScene
 
 _Floats = npt.NDArray[np.float64]
 _Flags = npt.NDArray[np.bool_]
 
-MOST_STATES = 32
-"""The geometry of each state is kept in memory while a dataset is read."""
+_MOST_STATES, _FEWEST_STATES, _MOST_TRIANGLES = 128, 32, 2_000_000
+"""The geometry of each state is kept in memory while a dataset is read. So the meshes of all states together have at
+most so many triangles, unless the states are the fewest already."""
+_DECIMALS = 6
 _SHUT_OR_OPEN = 0.25
 """The share of states in which a door is shut, and of those in which it is open; it is ajar in the others."""
 
@@ -39,7 +43,7 @@ class DoorStates:
         if not doors:
             return cls.none(emitters)
         rng = np.random.default_rng([seed, 14])
-        count = min(MOST_STATES, emitters)
+        count = min(_most_states(scene), emitters)
         openness, kind = rng.uniform(size=(count, doors)), rng.uniform(size=(count, doors))
         openness[kind < _SHUT_OR_OPEN] = 0.0
         openness[kind > 1 - _SHUT_OR_OPEN] = 1.0
@@ -68,7 +72,7 @@ class EmitterScenes:
 
     scene: SimulatedScene
     states: DoorStates
-    _by_state: dict[bytes, LevelScene] = field(default_factory=dict)
+    _by_state: dict[Openness, LevelScene] = field(default_factory=dict)
 
     def of(self, emitter: int) -> SimulatedScene:
         return self.at(self.states.openness[emitter])
@@ -78,14 +82,25 @@ class EmitterScenes:
         if not len(openness):
             return self.scene
         assert isinstance(self.scene, LevelScene)
-        state = openness.astype(np.float64).tobytes()
+        # In single precision, as a field is told of it, a state is the same.
+        state = tuple(np.round(openness.astype(np.float64), _DECIMALS).tolist())
         if state not in self._by_state:
-            self._by_state.setdefault(state, self.scene.with_doors(openness.tolist()))
+            self._by_state.setdefault(state, self.scene.with_doors(state, self._mesh))
         return self._by_state[state]
+
+    @cached_property
+    def _mesh(self) -> MeshWithDoors:
+        assert isinstance(self.scene, LevelScene)
+        return self.scene.mesh_with_doors()
 
     def groups(self, emitters: npt.NDArray[np.integer]) -> Mapping[int, npt.NDArray[np.int64]]:
         """Where in `emitters` (n,) those of each state are, by one emitter of that state."""
         return {int(emitters[here[0]]): here for here in alike(self.states.openness[emitters])}
+
+
+def _most_states(level: SimulatedScene) -> int:
+    assert isinstance(level, LevelScene)
+    return max(_FEWEST_STATES, min(_MOST_STATES, _MOST_TRIANGLES // len(level.place.mesh.triangles)))
 
 
 def alike(openness: npt.NDArray[np.floating]) -> list[npt.NDArray[np.int64]]:

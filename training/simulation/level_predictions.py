@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ
-from server.acoustics.doors import MeshWithDoors
 from server.acoustics.mesh_reflections import MeshWallLosses
 from server.acoustics.sound_path import SoundPaths
 from server.scene.surfaces import wall_losses_db
@@ -54,9 +53,8 @@ class LevelPredictions(Predictions):
         wanted = {"all doors open": (1.0,) * len(doors), "all doors shut": (0.0,) * len(doors)}
         if began not in wanted.values():
             wanted["doors as at the beginning"] = began
-        # Ways round edges are found once for all states.
-        mesh = MeshWithDoors(self.scene.mesh, self.scene.leaves[0], open_sky=self.scene.file.geometry.open_sky)
-        return {name: self.scene.with_doors(openness, mesh.at(openness)) for name, openness in wanted.items()}
+        mesh = self.scene.mesh_with_doors()
+        return {name: self.scene.with_doors(openness, mesh) for name, openness in wanted.items()}
 
     @cached_property
     def trials(self) -> Mapping[str, Trial]:

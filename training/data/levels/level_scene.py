@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError, model_validator
 
-from server.acoustics.doors import DoorLeaf
+from server.acoustics.doors import DoorLeaf, MeshWithDoors
 from server.acoustics.geometry import Points
 from server.acoustics.mesh import LONGEST_NAME, MeshError, TriangleMesh
 from server.acoustics.sound_path import SoundPathFinder
@@ -139,13 +139,19 @@ class LevelScene:
         mesh = TriangleMesh.joined([self.mesh, *at])
         return MeshGeometry(mesh, {name: materials[name] for name in mesh.materials})
 
-    def with_doors(self, openness: Sequence[float], known: MeshSurroundings | None = None) -> "LevelScene":
-        """The same level with its doors so far open, in their order. `known` are its surroundings then."""
+    def mesh_with_doors(self) -> MeshWithDoors:
+        """The mesh in which leaves move, as a server has it. It finds ways round edges once for all states."""
+        return MeshWithDoors(self.mesh, self.leaves[0], open_sky=self.file.geometry.open_sky)
+
+    def with_doors(self, openness: Sequence[float], mesh: MeshWithDoors | None = None) -> "LevelScene":
+        """The same level with its doors so far open, in their order; its surroundings are then as its
+        `mesh_with_doors` finds them, if that is given."""
         geometry = self.file.geometry
         doors = [
             door.model_copy(update={"openness": share}) for door, share in zip(geometry.doors, openness, strict=True)
         ]
         moved = geometry.model_copy(update={"doors": tuple(doors)})
+        known = None if mesh is None else mesh.at(tuple(openness))
         return replace(self, file=self.file.model_copy(update={"geometry": moved}), known=known)
 
     @cached_property
