@@ -26,6 +26,8 @@ from training.simulation.responses import SimulatedResponses
 
 # In nepers, and in shares of the power: about what no field can predict from the places alone.
 _SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}
+_EXCHANGED_SHARE = 0.5
+_LEAST_AJAR = 0.01
 _HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
 
 
@@ -46,8 +48,12 @@ class DirectionalLearner(BasisLearner):
         codec = codec_of(responses)
         self.cells = Cells(codec, min(recipe.fine_frames, codec.frames - 1), known_frames=0)
         self.site = Site.of(responses)
+        extent = self.site.extent
+        dropout = recipe.dropout if extent.doors else 0.0
         try:
-            field = DirectionalField(self.site.extent, self.cells, shape, recipe.order, reach=Reach.of(responses))
+            field = DirectionalField(
+                extent, self.cells, shape, recipe.order, reach=Reach.of(responses), dropout=dropout
+            )
         except ValueError as exc:
             raise RecipeError(str(exc)) from exc
         super().__init__(field, _SPREADS, _HEAD_WEIGHTS, InterpolatedBands(self.cells))
@@ -58,11 +64,9 @@ class DirectionalLearner(BasisLearner):
         used, _ = split(responses, share=configuration.share, seed=configuration.seed)
         ends = [responses.ends(row) for row in trainable[first]]
         self._openness = responses.openness[trainable[first]].astype(np.float32)
-        self._partner = (
-            _exchanged(ends, set(self._pair[used].tolist()), self._openness)
-            if recipe.reciprocal
-            else np.arange(len(ends))
-        )
+        pairs = np.arange(len(ends))
+        self._partner = _exchanged(ends, set(self._pair[used].tolist()), self._openness) if recipe.reciprocal else pairs
+        self._one_way = recipe.reciprocal & (self._partner == pairs)
 
     def prepare(self, progress: Progress) -> None:
         folder = self.responses.file.parent / TARGETS
@@ -84,14 +88,25 @@ class DirectionalLearner(BasisLearner):
             listener, emitter = (
                 end + rng.normal(0, self.recipe.noise_m, end.shape).astype(np.float32) for end in (listener, emitter)
             )
+        exchanged = np.zeros(len(pairs), dtype=bool)
+        if rng is not None:
+            exchanged = self._one_way[pairs] & (rng.random(len(pairs)) < _EXCHANGED_SHARE)
+            listener, emitter = (
+                np.where(exchanged[:, None], there, here) for here, there in ((listener, emitter), (emitter, listener))
+            )
         openness = self._openness[pairs]
+        paths = self.site.paths(listener, emitter, openness)
+        if rng is not None:
+            blurred = rng.normal(openness, self.recipe.openness_noise).clip(_LEAST_AJAR, 1 - _LEAST_AJAR)
+            openness = np.where((openness > 0) & (openness < 1), blurred, openness).astype(np.float32)
         told = (openness,) if openness.shape[1] else ()
-        poses = (listener, emitter, self.site.paths(listener, emitter, openness), *told)
-        return tuple(map(torch.from_numpy, poses)), (self._flat(rows),)
+        poses = (listener, emitter, paths, *told)
+        knows_directions = torch.from_numpy((~exchanged).astype(np.float32))
+        return tuple(map(torch.from_numpy, poses)), (self._flat(rows), knows_directions)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
-        (flat,) = targets
-        losses = self._head_losses(prediction, flat, {})
+        flat, knows_directions = targets
+        losses = self._head_losses(prediction, flat, {DIRECTIONS: knows_directions})
         error = self._energy_error.to(flat.device)(self._levels_of(prediction), flat[:, self.field.heads.levels])
         return {**losses, "energy": self.recipe.energy_weight * error}
 

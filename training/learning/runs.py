@@ -61,13 +61,19 @@ class DirectionalRecipe:
     """How a directional field is trained. `order`: highest order of its spherical harmonics, 0 to 3. `fine_frames`:
     number of frames that are predicted one by one, before cells. `energy_weight`: weight of the error of energies
     (`training.learning.energies`). `noise_m`: standard deviation of noise that is added to positions. `reciprocal`:
-    learn the mean power of a pair and of the pair with exchanged ends, which differ only by the randomness of rays."""
+    learn the mean power of a pair and of the pair with exchanged ends, which differ only by the randomness of rays. If
+    doors stand otherwise for the latter, the power is known one way only, and is learned as that of both, by turns.
+    In levels whose doors move, a pair is known with the doors in one state only, and a network soon learns most of them
+    by heart. There, `dropout` is the share of each hidden layer's features that a step leaves out, and `openness_noise`
+    the standard deviation of noise that is added to how far doors are ajar."""
 
     order: int = 2
     fine_frames: int = 24
     energy_weight: float = 3.0
     noise_m: float = 0.1
     reciprocal: bool = True
+    dropout: float = 0.2
+    openness_noise: float = 0.05
 
 
 @dataclass(frozen=True)

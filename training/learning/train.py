@@ -242,6 +242,8 @@ class _Loop:
         beta, share = self._learner.momentum_and_rate(self._fraction())
         for group in self._optimiser.param_groups:
             group["lr"], group["betas"] = configuration.learning_rate * share, (beta, 0.999)
+        # What a step leaves out depends on its number alone, so that a resumed run goes on as it would have.
+        torch.manual_seed(self._seed_of(state.step))
         loss = self._loss(parallel, inputs, targets, bfloat16=state.bfloat16)
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -260,6 +262,9 @@ class _Loop:
         state.epochs = state.step / self._steps_per_epoch
         state.round_loss += mean_loss
         state.round_steps += 1
+
+    def _seed_of(self, step: int) -> int:
+        return int(np.random.default_rng([self._configuration.seed, 10, step, self._processes.rank]).integers(2**63))
 
     def _is_plausible(self, loss: float) -> bool:
         """Whether the loss is finite and not far above the first one."""

@@ -36,6 +36,8 @@ class BasisField(nn.Module):
     """Flat predictions (B, heads.size), normalised by the mean and spread of each output over the training set. The
     inputs are those of the encoder: listener, emitter, for ears the yaw, and path.
 
+    While it is trained, a share `dropout` of each hidden layer's features is left out at random.
+
     `level_correction` (2, heads.size) is what to add to predicted levels, of pairs out of sight and in sight
     (`training.models.level_correction`).
     """
@@ -44,12 +46,15 @@ class BasisField(nn.Module):
     spread: Tensor
     level_correction: Tensor
 
-    def __init__(self, heads: Layout, encoder: PathEncoder | PoseEncoder, shape: FieldShape) -> None:
+    def __init__(
+        self, heads: Layout, encoder: PathEncoder | PoseEncoder, shape: FieldShape, *, dropout: float = 0.0
+    ) -> None:
         super().__init__()
         self.heads = heads
         self.encoder = encoder
         self._inputs = nn.Linear(self.encoder.size, shape.width)
         self._hidden = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1))
+        self._dropout = nn.Dropout(dropout)
         self._coefficients = nn.Linear(shape.width, shape.rank)
         self.basis = nn.Parameter(torch.randn(shape.rank, self.heads.size) / np.sqrt(shape.rank))
         self.register_buffer("mean", torch.zeros(self.heads.size))
@@ -75,7 +80,7 @@ class BasisField(nn.Module):
         """(B, rank) coefficients from the encoder's features."""
         hidden = nn.functional.gelu(self._inputs(features))
         for layer in self._hidden:
-            hidden = hidden + nn.functional.gelu(layer(hidden))
+            hidden = hidden + self._dropout(nn.functional.gelu(layer(hidden)))
         coefficients: Tensor = self._coefficients(hidden)
         return coefficients
 

@@ -48,11 +48,18 @@ class DirectionalField(BasisField):
     """The field of directions."""
 
     def __init__(
-        self, extent: Extent, cells: Cells, shape: FieldShape, order: int, *, reach: Reach | None = None
+        self,
+        extent: Extent,
+        cells: Cells,
+        shape: FieldShape,
+        order: int,
+        *,
+        reach: Reach | None = None,
+        dropout: float = 0.0,
     ) -> None:
         """Without `reach`, the field is valid throughout the place."""
         encoder = PathEncoder(extent, shape, reach or Reach.throughout(extent))
-        super().__init__(DirectionHeads(cells, order), encoder, shape)
+        super().__init__(DirectionHeads(cells, order), encoder, shape, dropout=dropout)
 
 
 class ExportedDirections(ExportedBasis):

@@ -47,7 +47,7 @@ def test_rows_have_the_places_and_target_of_their_pair(dataset, directional):
     learner.prepare(SILENT)
     rows = np.flatnonzero(~responses.held_out)
     chosen = np.array([7, 2, len(rows) - 1])
-    (listener, emitter, path), (flat,) = learner.batch(chosen, None)
+    (listener, emitter, path), (flat, _) = learner.batch(chosen, None)
     np.testing.assert_allclose(listener, responses.listener[rows[chosen]], atol=1e-5)
     np.testing.assert_allclose(emitter, responses.emitter[rows[chosen]], atol=1e-5)
     np.testing.assert_array_equal(path, learner.site.paths(listener.numpy(), emitter.numpy()))
@@ -74,11 +74,11 @@ def test_levels_are_those_of_both_ways_between_two_places(dataset, directional):
     levels = both.field.heads.levels
     for row in rows[:: 7 * len(dataset.yaws)]:
         emitter, listener = responses.ends(trainable[row])
-        _, (flat,) = alone.batch(np.array([row, by_ends[listener, emitter]]), None)
-        _, (mean,) = both.batch(np.array([row]), None)
+        _, (flat, _) = alone.batch(np.array([row, by_ends[listener, emitter]]), None)
+        _, (mean, _) = both.batch(np.array([row]), None)
         power = torch.exp(2 * flat[:, levels]).mean(dim=0)
         torch.testing.assert_close(torch.exp(2 * mean[0, levels]), power, rtol=1e-4, atol=1e-9)
-    (ours,), (stored,) = (each.batch(validation, None)[1] for each in learners)
+    (ours, _), (stored, _) = (each.batch(validation, None)[1] for each in learners)
     torch.testing.assert_close(ours, stored, rtol=0, atol=1e-6)
 
 
@@ -88,7 +88,7 @@ def test_what_it_learns_is_nearer_than_the_mean(dataset, learned):
     learner = load_learner(responses, learned)
     learner.prepare(SILENT)
     rows, _ = split(responses, share=1.0, seed=0)
-    poses, (flat,) = learner.batch(learner.validation(rows), None)
+    poses, (flat, _) = learner.batch(learner.validation(rows), None)
     field = learner.field
     with torch.no_grad():
         found = field.in_physical_units(field(*poses))
@@ -104,7 +104,7 @@ def test_power_is_that_of_the_training_pairs_on_average(dataset, learned):
     learner = load_learner(responses, learned)
     learner.prepare(SILENT)
     rows, _ = split(responses, share=1.0, seed=0)
-    poses, (flat,) = learner.batch(learner.validation(rows), None)
+    poses, (flat, _) = learner.batch(learner.validation(rows), None)
     levels = learner.field.heads.shapes["log_magnitude"]
     true = torch.exp(2 * flat[:, learner.field.heads.levels].reshape(-1, *levels))
     with torch.no_grad():

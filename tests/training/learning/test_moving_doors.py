@@ -6,9 +6,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 from rich.progress import Progress
 
 from server.acoustics.decibels import power_to_db
+from server.acoustics.mesh import TriangleMesh
 from server.field.fields_by_level import FieldsByLevel
 from server.scene.bundle import Bundle
 from tests.two_rooms import BEFORE, BEHIND, SWING, WOOD, door, leaf, rooms
@@ -22,8 +24,10 @@ from training.data.scene_file import SceneFile
 from training.evaluation.fields import field_columns
 from training.frontier.accuracy import Estimate, SampledPairs
 from training.learning.directional import DirectionalLearner
+from training.learning.pairs import split
 from training.learning.runs import RecipeError, configure
-from training.learning.train import train
+from training.learning.train import load_learner, train
+from training.models.site import Site
 from training.models.targets import codec_of
 from training.parallel.jobs import open_jobs
 from training.simulation.references import References
@@ -112,6 +116,92 @@ def test_pairs_in_unseen_states_are_not_trained_on(dataset):
     unseen = dataset.states.openness[dataset.states.unseen].astype(np.float32)
     assert not told & {share for (share,) in unseen.tolist()}
     assert len(learner._openness) == trained.sum()
+
+
+def test_a_power_that_is_known_one_way_is_learned_both_ways(dataset):
+    """Since sound is as loud the other way; where it comes from there is not known."""
+    responses = SimulatedResponses(dataset)
+    configuration = configure("directional", rank=16, width=32, epochs=1)
+    learner = DirectionalLearner(
+        responses, replace(configuration, recipe=replace(configuration.recipe, noise_m=0.0, openness_noise=0.0))
+    )
+    learner.prepare(QUIET)
+    rows, validation = split(responses, share=1.0, seed=0)
+    (listener, emitter, path, openness), (flat, knows_directions) = learner.batch(rows, np.random.default_rng(0))
+    trained = np.flatnonzero(~responses.held_out)[rows]
+    true_ends = responses.listener[trained].astype(np.float32), responses.emitter[trained].astype(np.float32)
+    exchanged = knows_directions.numpy() == 0
+    assert 0.4 < exchanged.mean() < 0.6
+    for found, same, other in ((listener, *true_ends), (emitter, *true_ends[::-1])):
+        np.testing.assert_array_equal(found, np.where(exchanged[:, None], other, same))
+    np.testing.assert_array_equal(openness, responses.openness[trained].astype(np.float32))
+    np.testing.assert_array_equal(path, learner.site.paths(listener.numpy(), emitter.numpy(), openness.numpy()))
+    _, (as_they_are, known) = learner.batch(rows, None)
+    np.testing.assert_array_equal(flat, as_they_are)
+    assert known.all()
+
+    prediction = learner.field(listener, emitter, path, openness).detach()
+    directions = learner.field.heads.slices["directions"]
+    elsewhere = flat.clone()
+    elsewhere[exchanged, directions] += 1.0
+    before, after = (learner.losses(prediction, (each, knows_directions)) for each in (flat, elsewhere))
+    assert before == after
+    assert learner.losses(prediction, (elsewhere, known))["directions"] > before["directions"]
+    assert learner.batch(validation, None)[1][1].all()
+
+
+def test_the_network_is_told_of_doors_ajar_with_noise(dataset):
+    """And of doors that are shut or open as they are; what it is told of paths is of where the doors are."""
+    responses = SimulatedResponses(dataset)
+    learner = DirectionalLearner(responses, configure("directional", rank=16, width=32, epochs=1))
+    learner.prepare(QUIET)
+    rows, _ = split(responses, share=1.0, seed=0)
+    true = responses.openness[np.flatnonzero(~responses.held_out)[rows]].astype(np.float32)
+    (listener, emitter, path, openness), _ = learner.batch(rows, np.random.default_rng(0))
+    ajar = (true > 0) & (true < 1)
+    off = openness.numpy() - true
+    assert not off[~ajar].any()
+    assert 0.04 < off[ajar].std() < 0.06
+    assert 0 < openness.numpy()[ajar].min() < openness.numpy()[ajar].max() < 1
+    np.testing.assert_array_equal(path, learner.site.paths(listener.numpy(), emitter.numpy(), true))
+    np.testing.assert_array_equal(learner.batch(rows, None)[0][3], true)
+
+
+def test_a_run_that_pauses_after_every_step_leaves_out_the_same_features(dataset, tmp_path):
+    responses = SimulatedResponses(dataset)
+    configuration = configure("directional", rank=8, width=16, epochs=1, batch=16)
+    assert train(responses, tmp_path / "whole", configuration, QUIET)
+    pauses = 0
+    while not train(responses, tmp_path / "paused", configuration, QUIET, pause_after_s=0.0):
+        pauses += 1
+    assert pauses > 2
+    whole, paused = (load_learner(responses, tmp_path / name).field for name in ("whole", "paused"))
+    for name, values in whole.state_dict().items():
+        torch.testing.assert_close(paused.state_dict()[name], values, rtol=0, atol=0)
+    told = [torch.from_numpy(each[:1].astype(np.float32)) for each in (responses.listener, responses.emitter)]
+    path, openness = torch.zeros(1, 6), torch.ones(1, 1)
+    assert torch.equal(whole(*told, path, openness), whole(*told, path, openness))
+    whole.train()
+    assert not torch.equal(whole(*told, path, openness), whole(*told, path, openness))
+
+
+def test_a_field_is_told_of_paths_that_a_server_finds(dataset, bundle):
+    site = Site.of(SimulatedResponses(dataset))
+    pairs = np.argwhere(dataset.trained)[::7]
+    emitter, listener = dataset.probes[pairs[:, 0]], dataset.probes[pairs[:, 1]]
+    openness = dataset.states.openness[pairs[:, 0]].astype(np.float32)
+    found = site.paths(listener, emitter, openness)
+    for number in range(0, len(pairs), 5):
+        there = bundle.with_doors(tuple(openness[number].tolist())).surroundings.sound_paths(343.0)
+        described = there.describe(listener[number : number + 1], emitter[number : number + 1]).described
+        np.testing.assert_allclose(found[number : number + 1], described, atol=1e-4)
+
+
+def test_a_large_level_has_fewer_states():
+    small = level()
+    large = TriangleMesh.joined([small.mesh] * (100_000 // len(small.mesh.triangles)))
+    counts = [len(alike(DoorStates.of(replace(small, mesh=mesh), 200, 0).openness)) for mesh in (small.mesh, large)]
+    assert counts[1] <= 32 < counts[0]
 
 
 def test_energies_are_of_the_state_of_their_emitter(dataset):
