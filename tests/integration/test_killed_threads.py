@@ -114,6 +114,13 @@ async def listening(address):
     return listeners
 
 
+async def leave(listeners):
+    """End their connections, and wait for that: to be cancelled once more at the loop's end leaves sockets open."""
+    for listener in listeners:
+        listener.task.cancel()
+    await asyncio.gather(*(listener.task for listener in listeners), return_exceptions=True)
+
+
 def die(*_):
     """No boundary between streams holds this back."""
     sys.exit()
@@ -134,7 +141,7 @@ def test_streams_of_a_thread_that_is_killed_between_two_ticks_go_on(engine, serv
         for listener in listeners:
             assert listener.sequences == list(range(len(listener.sequences)))
             assert listener.error is None
-            listener.task.cancel()
+        await leave(listeners)
 
     asyncio.run(scenario())
 
@@ -154,7 +161,7 @@ def test_streams_that_a_thread_is_killed_at_are_told_and_newcomers_are_served(en
         for listener in (*staying, *newcomers):
             await listener.hear()
             assert listener.error is None
-            listener.task.cancel()
+        await leave([*staying, *newcomers])
 
     asyncio.run(scenario())
 
@@ -167,8 +174,7 @@ def test_a_server_whose_threads_die_again_and_again_is_not_ready(engine, served_
             dead = engine.threads[0]
             dead.turns.deal = die
             await until(lambda dead=dead: dead not in engine.threads, WITHIN_S)
-            for listener in listeners:
-                listener.task.cancel()
+            await leave(listeners)
         await readiness_is(served_anew, 503, WITHIN_S)
 
     asyncio.run(scenario())
@@ -188,6 +194,6 @@ def test_a_server_with_a_thread_that_is_stuck_is_not_ready_until_it_goes_on(engi
         await readiness_is(served_anew, 200, WITHIN_S)
         for listener in listeners:
             await listener.hear()
-            listener.task.cancel()
+        await leave(listeners)
 
     asyncio.run(scenario())
