@@ -66,7 +66,7 @@ class DirectionalLearner(BasisLearner):
         self._openness = responses.openness[trainable[first]].astype(np.float32)
         pairs = np.arange(len(ends))
         self._partner = _exchanged(ends, set(self._pair[used].tolist()), self._openness) if recipe.reciprocal else pairs
-        self._one_way = recipe.reciprocal & (self._partner == pairs)
+        self._one_way = (recipe.reciprocal and extent.doors > 0) & (self._partner == pairs)
 
     def prepare(self, progress: Progress) -> None:
         folder = self.responses.file.parent / TARGETS

@@ -82,6 +82,20 @@ def test_levels_are_those_of_both_ways_between_two_places(dataset, directional):
     torch.testing.assert_close(ours, stored, rtol=0, atol=1e-6)
 
 
+def test_without_doors_pairs_are_learned_as_they_are(dataset, directional):
+    """Also those whose reverse is not used, as with a share of the pairs."""
+    responses = SimulatedResponses(dataset)
+    recipe = dataclasses.replace(directional.recipe, noise_m=0.0)
+    learner = DirectionalLearner(responses, dataclasses.replace(directional, recipe=recipe, share=0.5))
+    learner.prepare(SILENT)
+    rows, _ = split(responses, share=0.5, seed=0)
+    (listener, emitter, _), (_, knows_directions) = learner.batch(rows, np.random.default_rng(0))
+    trained = np.flatnonzero(~responses.held_out)[rows]
+    np.testing.assert_allclose(listener, responses.listener[trained], atol=1e-5)
+    np.testing.assert_allclose(emitter, responses.emitter[trained], atol=1e-5)
+    assert knows_directions.all()
+
+
 def test_what_it_learns_is_nearer_than_the_mean(dataset, learned):
     """Of pairs that it trained on: levels of bands, and directions."""
     responses = SimulatedResponses(dataset)
