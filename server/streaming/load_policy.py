@@ -18,6 +18,7 @@ down soon after, waits twice as long the next time: near a limit, a stream stays
 Times are seconds of one monotonic clock. The thresholds, with their reasons, are in `server.streaming.load_thresholds`.
 """
 
+import itertools
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -45,6 +46,8 @@ class LoadSample:
     ir_wait_s: float | None = None
     request_s: float = 0.0
     plan_s: float = 0.0
+    rendering: float = 0.0
+    is_in_effect: bool = True
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,12 @@ class Measurement(Generic[Key]):
     def lateness(self) -> float:
         """The worst lateness of all streams."""
         return max((sample.lateness for sample in self.streams.values()), default=0.0)
+
+    @property
+    def demand(self) -> float:
+        """Share of a core that the blocks of all streams have to get to be in time: it may exceed 1, and lies below
+        `busy` while a thread works off what has piled up."""
+        return sum(sample.rendering for sample in self.streams.values()) or self.busy
 
 
 @dataclass(frozen=True)
@@ -106,7 +115,9 @@ class RenderAhead:
     since that number changed.
 
     `caution` multiplies the length of the `long_mean` that calls for fewer blocks. `periods_since_fewer` counts from
-    the last decrease, while that may still prove to have been too early.
+    the last decrease, while that may still prove to have been too early. `calm_periods` counts from when blocks were
+    last nearly late, while they are expected to be so again. After they were, with a `late_caution` above 1, the number
+    does not decrease meanwhile.
     """
 
     blocks: int = 1
@@ -115,6 +126,8 @@ class RenderAhead:
     long_mean: float = 0.0
     caution: int = 1
     periods_since_fewer: int | None = None
+    calm_periods: int | None = None
+    late_caution: int = 1
 
     @property
     def restarted(self) -> "RenderAhead":
@@ -129,8 +142,14 @@ class ThreadState:
     ahead: RenderAhead = RenderAhead()
     overloaded_periods: int = 0
     well_since_s: float | None = None
+    lateness: float = 0.0
+    """The worst of the last period."""
+    catches_up: bool = False
+    """Whether blocks have time enough, and those of the last period were less late than those before."""
     moved_s: float = -math.inf
-    """When the thread last made streams step down."""
+    """When the thread last made streams step down because it had too much to do."""
+    changed_s: float = -math.inf
+    """When the number of blocks at once last changed or streams last stepped down: waits for IRs change with both."""
 
     @property
     def restarted(self) -> "ThreadState":
@@ -168,7 +187,7 @@ def decide(
     can_make_time = state.thread.ahead.blocks < thresholds.blocks_at_once[-1]
     thread = _judge_thread(thresholds, state.thread, measurement, can_make_time=can_make_time)
     ladders = {
-        key: _judge_stream(thresholds, state.ladders[key], sample, measurement.now_s)
+        key: _judge_stream(thresholds, state.ladders[key], sample, measurement.now_s, changed_s=thread.changed_s)
         for key, sample in measurement.streams.items()
     }
     thread, ladders, moved = _move(thresholds, thread, ladders, measurement)
@@ -190,7 +209,7 @@ def decide(
 def render_ahead(thresholds: Thresholds, ahead: RenderAhead, *, busy: float, lateness: float) -> RenderAhead:
     """Return the blocks at once after a period in which a thread rendered for the share `busy`, with the worst lateness
     `lateness`."""
-    ahead = _average(thresholds, ahead, busy)
+    ahead = _note_lateness(thresholds, _average(thresholds, ahead, busy), lateness)
     numbers = thresholds.blocks_at_once
     at = numbers.index(ahead.blocks)
     has_mean = ahead.periods >= thresholds.mean_periods
@@ -201,15 +220,30 @@ def render_ahead(thresholds: Thresholds, ahead: RenderAhead, *, busy: float, lat
         # A short peak of load does not show that fewer blocks were too few.
         has_relapsed = is_full and ahead.periods_since_fewer is not None
         caution = min(thresholds.most_caution, 2 * ahead.caution) if has_relapsed else ahead.caution
-        return RenderAhead(numbers[at + 1], caution=caution)
-    if at == 0:
+        return replace(ahead.restarted, blocks=numbers[at + 1], caution=caution, periods_since_fewer=None)
+    if at == 0 or (ahead.late_caution > 1 and ahead.calm_periods is not None):
         return ahead
     left = 1 - thresholds.saved_by_doubling
     would_do = has_long_mean and ahead.long_mean / left < thresholds.more_blocks_above[at - 1]
     # Where even a quarter of the blocks would suffice, half of them certainly do.
     if would_do or (has_mean and ahead.mean_busy / left**2 < thresholds.more_blocks_above[at - 1]):
-        return RenderAhead(numbers[at - 1], caution=ahead.caution, periods_since_fewer=0)
+        return replace(ahead.restarted, blocks=numbers[at - 1], periods_since_fewer=0)
     return ahead
+
+
+def _note_lateness(thresholds: Thresholds, ahead: RenderAhead, lateness: float) -> RenderAhead:
+    """Note whether blocks were nearly late. A load that makes them so again within `relapse_s` is expected to come once
+    more, and each time that it does, for twice as long."""
+    calm = ahead.calm_periods
+    if lateness > thresholds.tight:
+        comes_again = calm is not None and calm * thresholds.period_s > thresholds.clear_s
+        caution = min(thresholds.most_caution, 2 * ahead.late_caution) if comes_again else ahead.late_caution
+        return replace(ahead, calm_periods=0, late_caution=caution)
+    if calm is None:
+        return ahead
+    if (calm + 1) * thresholds.period_s > thresholds.relapse_s * ahead.late_caution:
+        return replace(ahead, calm_periods=None, late_caution=1)
+    return replace(ahead, calm_periods=calm + 1)
 
 
 def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderAhead:
@@ -220,13 +254,13 @@ def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderA
         if since * thresholds.period_s > thresholds.relapse_s * caution:
             since, caution = None, max(1, caution // 2)
     newest, newest_of_long = (max(1 / periods, thresholds.newest_weight / times) for times in (1, ahead.caution))
-    return RenderAhead(
-        ahead.blocks,
-        ahead.mean_busy + newest * (busy - ahead.mean_busy),
-        periods,
-        ahead.long_mean + newest_of_long * (busy - ahead.long_mean),
-        caution,
-        since,
+    return replace(
+        ahead,
+        mean_busy=ahead.mean_busy + newest * (busy - ahead.mean_busy),
+        periods=periods,
+        long_mean=ahead.long_mean + newest_of_long * (busy - ahead.long_mean),
+        caution=caution,
+        periods_since_fewer=since,
     )
 
 
@@ -263,23 +297,50 @@ def _judge_thread(
     """Return the thread's state after the measurement. A thread that `can_make_time` by other means is not overloaded
     as long as no block is nearly late."""
     busy, lateness = measurement.busy, measurement.lateness
-    is_overloaded = (busy > thresholds.full_busy and not can_make_time) or lateness > thresholds.tight
-    is_well = busy <= thresholds.free_busy and lateness <= thresholds.easy
+    # What has piled up before the last change is worked off.
+    has_changed = measurement.now_s - thread.changed_s < 1.5 * thresholds.period_s
+    catches_up = measurement.demand <= thresholds.full_busy and (has_changed or lateness < thread.lateness)
+    is_full = busy > thresholds.full_busy and not can_make_time
+    is_overloaded = (is_full or lateness > thresholds.tight) and not catches_up
+    is_well = (
+        _with_most_blocks(thresholds, busy, thread.ahead.blocks) <= thresholds.free_busy and lateness <= thresholds.easy
+    )
     ahead = render_ahead(thresholds, thread.ahead, busy=busy, lateness=lateness)
     if ahead.blocks < measurement.least_blocks:
-        ahead = RenderAhead(measurement.least_blocks, caution=thread.ahead.caution)
+        ahead = replace(thread.ahead.restarted, blocks=measurement.least_blocks, periods_since_fewer=None)
     return replace(
         thread,
         ahead=ahead,
+        lateness=lateness,
+        catches_up=catches_up,
+        changed_s=thread.changed_s if ahead.blocks == thread.ahead.blocks else measurement.now_s,
         overloaded_periods=thread.overloaded_periods + 1 if is_overloaded else 0,
         well_since_s=_since(thread.well_since_s, measurement.now_s, is_so=is_well),
     )
 
 
-def _judge_stream(thresholds: Thresholds, ladder: Ladder, sample: LoadSample, now_s: float) -> Ladder:
-    """Return a stream's ladder after the measurement of how long it waits for IRs."""
-    wait_s = sample.ir_wait_s or 0.0
-    is_overloaded = wait_s > patience_s(thresholds, ladder.step)
+def _new_wait_s(thresholds: Thresholds, wait_s: float, since_s: float) -> float:
+    """Return for how long a stream has waited for IRs since the last change of what its thread gives up, which was
+    `since_s` seconds ago. A wait from before says nothing of it, unless it goes on for long."""
+    return min(wait_s, since_s) if wait_s <= since_s or since_s > thresholds.stale_wait_s else 0.0
+
+
+def _with_most_blocks(thresholds: Thresholds, busy: float, blocks: int) -> float:
+    """Return the busy share of a thread if it rendered the most blocks at once: poses are heard later before quality
+    stays low."""
+    numbers = thresholds.blocks_at_once
+    doublings = len(numbers) - 1 - numbers.index(blocks)
+    return busy * (1 - thresholds.surely_saved) ** doublings
+
+
+def _judge_stream(
+    thresholds: Thresholds, ladder: Ladder, sample: LoadSample, now_s: float, *, changed_s: float
+) -> Ladder:
+    """Return a stream's ladder after the measurement of how long it waits for IRs, on a thread that last changed at
+    `changed_s`."""
+    wait_s = _new_wait_s(thresholds, sample.ir_wait_s or 0.0, now_s - changed_s)
+    # IRs of another level are all computed anew: how long that takes says nothing of the waits that follow.
+    is_overloaded = sample.is_in_effect and wait_s > patience_s(thresholds, ladder.step)
     expected_s = wait_s * ladder.above.cost_ms / ladder.step.cost_ms
     would_be_well = expected_s <= thresholds.patience_above * patience_s(thresholds, ladder.above)
     judged = replace(
@@ -311,19 +372,27 @@ def _move(
             ladders[key] = _lowered(thresholds, ladders[key], now_s)
             moved[key] = "load"
 
-    for key, ladder in ladders.items():
-        has_waited = ladder.overloaded_periods >= thresholds.overloaded_periods
-        if has_waited and now_s - ladder.moved_s >= thresholds.settle_s:
+    if now_s - thread.changed_s >= thresholds.settle_s and (slow := _slowest(thresholds, thread, ladders, measurement)):
+        for key in slow:
             lower(key)
-    is_overloaded = thread.overloaded_periods >= thresholds.overloaded_periods or measurement.lateness > thresholds.late
-    if is_overloaded and now_s - thread.moved_s >= thresholds.settle_s:
-        for key in _best_off(ladders):
+        # The others wait in the same queue: whether that was enough, only new waits can tell.
+        ladders.update({key: replace(ladder, overloaded_periods=0) for key, ladder in ladders.items()})
+        thread = replace(thread, changed_s=now_s)
+    is_late = measurement.lateness > thresholds.late and not thread.catches_up
+    is_overloaded = thread.overloaded_periods >= thresholds.overloaded_periods or is_late
+    if is_overloaded and (moved or thread.changed_s < now_s) and now_s - thread.moved_s >= thresholds.settle_s:
+        best_off, is_enough = _best_off(thresholds, ladders, measurement)
+        for key in best_off:
             lower(key)
-        return replace(thread, moved_s=now_s), ladders, moved
+        # While blocks are late, steps that save too little are not waited for.
+        moved_s = now_s if is_enough or not is_late else thread.moved_s
+        return replace(thread, moved_s=moved_s, changed_s=now_s), ladders, moved
     rising = [
         key
         for key, ladder in ladders.items()
-        if _may_rise(thresholds, thread, ladder, now_s) and (measurement.has_room_on_top or ladder.at > 1)
+        if _may_rise(thresholds, thread, ladder, now_s)
+        and (measurement.has_room_on_top or ladder.at > 1)
+        and _has_time_above(thresholds, thread, ladder, measurement.streams[key].rendering, measurement.demand)
     ]
     if rising and not moved:
         key = max(rising, key=lambda key: ladders[key].at)
@@ -332,11 +401,47 @@ def _move(
     return thread, ladders, moved
 
 
-def _best_off(ladders: Mapping[Key, Ladder]) -> Sequence[Key]:
-    """Return the streams on the highest steps among those that can still step down."""
-    able = [key for key, ladder in ladders.items() if not ladder.is_lowest]
-    highest = min((ladders[key].at for key in able), default=0)
-    return [key for key in able if ladders[key].at == highest]
+def _slowest(
+    thresholds: Thresholds, thread: ThreadState, ladders: Mapping[Key, Ladder], measurement: Measurement[Key]
+) -> Sequence[Key]:
+    """Return which of the streams that have waited too long for IRs step down: as large a part of them as the longest
+    wait is too long, those on the highest steps first. They wait in one queue, so each gains by the steps of others."""
+    since_s = measurement.now_s - thread.changed_s
+    waits_s = {
+        key: _new_wait_s(thresholds, measurement.streams[key].ir_wait_s or 0.0, since_s)
+        for key, ladder in ladders.items()
+        if ladder.overloaded_periods >= thresholds.overloaded_periods
+        and measurement.streams[key].is_in_effect
+        and not ladder.is_lowest
+    }
+    excess = max((_excess(thresholds, ladders[key], wait_s) for key, wait_s in waits_s.items()), default=0)
+    ranked = sorted(waits_s, key=lambda key: (ladders[key].at, -waits_s[key]))
+    return ranked[: math.ceil(excess * len(ranked))]
+
+
+def _excess(thresholds: Thresholds, ladder: Ladder, wait_s: float) -> float:
+    """Return the share of a wait for IRs that is beyond a stream's patience."""
+    return max(0.0, 1 - patience_s(thresholds, ladder.step) / wait_s) if wait_s else 0.0
+
+
+def _best_off(
+    thresholds: Thresholds, ladders: Mapping[Key, Ladder], measurement: Measurement[Key]
+) -> tuple[Sequence[Key], bool]:
+    """Return which streams step down in a thread with too much to do, and whether that is expected to be enough: those
+    on the highest steps, and as many as it takes, by what their blocks take now."""
+    ranked = sorted((key for key, ladder in ladders.items() if not ladder.is_lowest), key=lambda key: ladders[key].at)
+    highest = [key for key in ranked if ladders[key].at == ladders[ranked[0]].at]
+    rendering = {key: sample.rendering for key, sample in measurement.streams.items()}
+    excess = measurement.demand - thresholds.relieved_busy
+    saved = [*itertools.accumulate(_saving(thresholds, ladders[key]) * rendering[key] for key in highest)]
+    needed = max(1 + sum(so_far < excess for so_far in saved), math.ceil(thresholds.least_lowered * len(ladders)))
+    return highest[:needed], needed <= len(highest)
+
+
+def _saving(thresholds: Thresholds, ladder: Ladder) -> float:
+    """Return the share of what a stream's blocks take that its next step down is expected to save."""
+    now, then = (thresholds.rendering_by_sharing[step.sharing] for step in (ladder.step, ladder.steps[ladder.at + 1]))
+    return 1 - then / now
 
 
 def _may_rise(thresholds: Thresholds, thread: ThreadState, ladder: Ladder, now_s: float) -> bool:
@@ -344,6 +449,16 @@ def _may_rise(thresholds: Thresholds, thread: ThreadState, ladder: Ladder, now_s
         return False
     since_s = max(ladder.well_since_s, thread.well_since_s, ladder.moved_s)
     return now_s - since_s >= ladder.caution * thresholds.clear_s
+
+
+def _has_time_above(
+    thresholds: Thresholds, thread: ThreadState, ladder: Ladder, rendering: float, demand: float
+) -> bool:
+    """Return whether a thread has time for the blocks of a stream, which take the share `rendering` of a core, on its
+    next better step."""
+    above = replace(ladder, at=ladder.at - 1)
+    risen = demand + rendering * (1 / (1 - _saving(thresholds, above)) - 1)
+    return _with_most_blocks(thresholds, risen, thread.ahead.blocks) <= thresholds.free_busy
 
 
 def _lowered(thresholds: Thresholds, ladder: Ladder, now_s: float) -> Ladder:

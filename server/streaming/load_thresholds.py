@@ -35,9 +35,17 @@ class Thresholds:
     full_busy: float = 0.85
     """Busy share from which on a thread has no time to spare, unless it can make some by rendering more blocks at once.
     The rest is what the event loop and the system take."""
-    free_busy: float = 0.6
-    """Busy share up to which streams may step up. It lies so far below `full_busy` that one step up does not fill the
-    thread."""
+    relieved_busy: float = 0.75
+    """Share of a core down to which steps down are to bring what the blocks of a full thread take."""
+    rendering_by_sharing: tuple[float, ...] = (1.0, 0.6, 0.5)
+    """What a block takes, as a share of one whose emitters share nothing, if they share nothing, a tail, or their
+    reverberation: what a step down is expected to save."""
+    least_lowered: float = 1 / 8
+    """Share of the streams that step down at least where blocks are late, which is not always for lack of time to
+    render."""
+    free_busy: float = 0.72
+    """Busy share, with the most blocks at once and with what the step takes, up to which a stream may step up. It lies
+    so far below `full_busy` that load may vary."""
     late: float = 1.0
     """Lateness beyond which a block is late: streams step down in the same period."""
     tight: float = 0.5
@@ -48,6 +56,8 @@ class Thresholds:
     """Periods in a row that show too much load before a stream steps down: one alone is a hiccup."""
     settle_s: float = 0.75
     """Seconds between two steps down: the first has to show in what is measured."""
+    stale_wait_s: float = 2.0
+    """Seconds after which a wait for responses counts that has gone on since before the last change."""
     clear_s: float = 4.0
     """Seconds in which all has to be well before a stream steps up: a change of quality every few seconds would be
     heard."""
@@ -79,6 +89,8 @@ class Thresholds:
     saved_by_doubling: float = 1 / 7
     """Largest share of a thread's time that doubling the blocks at once saves. A thread renders half as many blocks at
     once if it would manage even without that saving."""
+    surely_saved: float = 0.1
+    """Share of a thread's time that doubling the blocks at once saves at least."""
     mean_periods: int = 3
     """Periods after a change until a mean of busy shares says something."""
     newest_weight: float = 0.25

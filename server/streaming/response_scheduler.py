@@ -126,7 +126,13 @@ class ResponseScheduler:
             self._look_again()
         self._wanted, self._reason = quality, reason
         self._effects.bus = self._levels[quality.level].level.bus
+        self._share()
         return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
+
+    def _share(self) -> None:
+        """Have emitters share at once what the step chosen last shares, whatever its level: IRs of another level may be
+        long in coming on a server that has too much to do, and shared ones take less time to render."""
+        self._effects.share(max(self.heard.sharing, self._wanted.sharing), self._emitters)
 
     def change_quality_unheard(self) -> list[ServerMessage]:
         """Change to the step chosen last if no emitter has, or will have, an IR that differs between levels."""
@@ -138,7 +144,7 @@ class ResponseScheduler:
         if self._wanted == self.heard:
             return []
         self.heard = self._wanted
-        self._effects.share(self.heard.sharing, self._emitters)
+        self._share()
         return [
             LevelChanged(
                 level=self.heard.level,
@@ -184,7 +190,7 @@ class ResponseScheduler:
     def enforce_plan(self) -> list[ServerMessage]:
         """Put the plan of effects into effect, from the next block on."""
         events = self._announce(self._effects.enforce(self._emitters))
-        self._effects.share(self.heard.sharing, self._emitters)
+        self._share()
         self._look_again()
         return events + self.change_quality_unheard()
 

@@ -85,6 +85,14 @@ class CpuCosts:
 
 
 @dataclass
+class Rendering:
+    """Seconds that it took to render blocks of so many seconds."""
+
+    cost_s: float = 0.0
+    duration_s: float = 0.0
+
+
+@dataclass
 class ShownCost:
     """What a stream has shown that it takes, as shares of a core: the highest of the last half minute or so. Readers on
     other threads may find one value newer than another."""
@@ -146,6 +154,8 @@ class Stream:
         """When the next block should be rendered; infinite before the start and in a pause."""
         self._costs = CpuCosts()
         self.shown = ShownCost()
+        self._rendered = Rendering()
+        """Blocks of this period."""
         self._request_cpu_s = 0.0
         """CPU time of the requests that were answered in this period."""
         self._inbox = Inbox()
@@ -363,7 +373,15 @@ class Stream:
         lateness = lateness_s / (self._lead * self.block_s)
         waits_s = [member.wait.take_longest_s(now_s) for member in self.audience.members]
         longest_s = max((wait_s for wait_s in waits_s if wait_s is not None), default=None)
-        return LoadSample(lateness, longest_s if self.is_measured else None, self.request_s, self._costs.plan_s)
+        rendered, self._rendered = self._rendered, Rendering()
+        return LoadSample(
+            lateness,
+            longest_s if self.is_measured else None,
+            self.request_s,
+            self._costs.plan_s,
+            rendering=rendered.cost_s / rendered.duration_s if rendered.duration_s else self.load,
+            is_in_effect=all(member.session.quality == self.ladder.step for member in self.audience.members),
+        )
 
     def note_sent(self, deadline_s: float, now_s: float) -> bool:
         """Note that a block is sent now; return whether it is late. The sender calls this: a block that is ready in
@@ -410,6 +428,8 @@ class Stream:
             if number < len(blocks)
         ]
         each_s = cost_s / count
+        self._rendered.cost_s += cost_s
+        self._rendered.duration_s += count * self.block_s
         self.load += (1 - (1 - _LOAD_SMOOTHING) ** count) * (each_s / self.block_s - self.load)
         self.times.render.add(each_s, count)
         if self.next_block >= self._lead:  # the first blocks were due before the stream started

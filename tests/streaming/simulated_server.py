@@ -255,6 +255,7 @@ class SimulatedSession:
         self.window = SendWindow(2**40)
         self.renderer = self
         self.quality = self.wanted = quality
+        self.sharing = quality.sharing
         self.sample_clock = 0
         self.newest_pose_id = self.asked_pose_id = 0
         self.answered_s: list[float] = []
@@ -296,6 +297,7 @@ class SimulatedSession:
         self._in_flight, self.is_exchange = False, True
         if request.level == self.wanted.level:
             self.quality = self.wanted
+        self.sharing = max(self.quality.sharing, self.wanted.sharing)
         return []
 
     def set_quality(self, quality, _reason: str) -> list:
@@ -304,6 +306,7 @@ class SimulatedSession:
         elif quality.level != self.wanted.level:
             self._next_s = 0.0
         self.wanted = quality
+        self.sharing = max(self.quality.sharing, quality.sharing)
         return []
 
     def set_ir_interval(self, interval_s: float) -> None:
@@ -617,7 +620,7 @@ class SimulatedServer:
         cost_s = costs.tick_s
         for session, count in Counter(sessions).items():
             emitters = self._by_session[session].emitters
-            share = costs.shared[session.quality.sharing] * emitters / 16
+            share = costs.shared[session.sharing] * emitters / 16
             saved = (1 - costs.saved_by_doubling) ** (math.log2(count))
             cost_s += count * costs.block_s * share * saved + session.is_exchange * costs.exchange_s * emitters / 16
             blocks += [Rendered(_SILENCE, session.is_exchange and number == 0, False) for number in range(count)]

@@ -119,6 +119,25 @@ def test_levels_that_switch_while_a_tone_sounds_do_not_splatter(open_session, le
     assert 10 * np.log10(power[:, high].sum() / power.sum()) < -90
 
 
+def test_a_step_that_shares_more_does_so_before_its_responses_have_arrived(open_session, levels):
+    """A core that is full may compute none of the cheaper level, and would stay full."""
+    session = open_session()
+    add(session)
+    answer(session, levels)
+    convolver = next(iter(session.renderer._mixers)).convolver
+    assert convolver._sharing is Sharing.NOTHING
+    assert session.set_quality(QualityStep("fast", None, Sharing.REVERBERATION, 1.0), "load") == []
+    assert convolver._sharing is Sharing.REVERBERATION
+    session.set_quality(GOOD, "recovered")
+    assert convolver._sharing is Sharing.NOTHING
+    session.set_quality(QualityStep("fast", None, Sharing.TAIL, 1.0), "load")
+    answer(session, levels)
+    session.set_quality(GOOD, "recovered")
+    assert convolver._sharing is Sharing.TAIL, "what is heard shares until better responses have arrived"
+    answer(session, levels)
+    assert convolver._sharing is Sharing.NOTHING
+
+
 def test_a_rate_alone_changes_at_once(open_session, levels):
     session = open_session()
     add(session)

@@ -3,6 +3,7 @@ arithmetic."""
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_one_hiccup_that_makes_nothing_late_changes_nothing():
 @pytest.mark.parametrize(("lateness", "steps"), [(0.0, set()), (0.6, {"load"})])
 def test_a_full_thread_that_can_make_time_lowers_nobody_until_blocks_are_nearly_late(lateness, steps):
     host = Host([ladder(1, 2)], lambda _: LoadSample(lateness), lambda _: 0.99, ahead=RenderAhead())
-    for _ in range(3):
+    for _ in range(4):
         host.measure()
     assert {reason for _, _, reason in host.steps} == steps
 
@@ -118,7 +119,7 @@ def test_a_load_that_ends_is_recovered_from_step_by_step():
 
 def test_between_overloaded_and_well_nothing_moves():
     host = Host([ladder(1, 2, 3)], busy=lambda _: 1.0).run(2)
-    at, host.busy = host.ladders[0].at, lambda _: 0.7
+    at, host.busy = host.ladders[0].at, lambda _: 0.78
     assert at > 0
     host.run(300)
     assert host.ladders[0].at == at
@@ -136,6 +137,74 @@ def test_near_a_limit_steps_become_rare():
 def test_a_stream_whose_responses_are_slow_steps_down_alone():
     host = Host([ladder(1, 2), ladder(1, 2)], lambda number: LoadSample(ir_wait_s=[0.4, 0.01][number])).run(10)
     assert {number for _, number, _ in host.steps} == {0}
+
+
+@pytest.mark.parametrize(("wait_s", "least", "most"), [(0.18, 3, 4), (0.3, 10, 10), (1.5, 18, 18)])
+def test_as_large_a_part_of_those_who_wait_steps_down_as_their_wait_is_too_long(wait_s, least, most):
+    """They wait in one queue. The others see first whether that is enough."""
+    host = Host([ladder(1, 2)] * 20, lambda _: LoadSample(ir_wait_s=wait_s))
+    for _ in range(4):
+        host.measure()
+    host.sample = lambda _: LoadSample(ir_wait_s=0.1)
+    host.run(3)
+    assert least <= len(host.steps) <= most
+
+
+def test_a_step_whose_responses_have_not_arrived_is_followed_by_no_other():
+    host = Host([ladder(1, 2)], lambda _: LoadSample(ir_wait_s=0.4, is_in_effect=False)).run(10)
+    assert host.steps == []
+
+
+def test_a_wait_that_began_before_the_last_change_says_nothing_of_it():
+    """Until it goes on for long."""
+    host = Host([ladder(1, 2)] * 8, lambda _: LoadSample(ir_wait_s=0.3))
+    while not host.steps:
+        host.measure()
+    changed_s, before = host.now_s, len(host.steps)
+    host.sample = lambda _: LoadSample(ir_wait_s=0.3 + host.now_s - changed_s)
+    host.run(1.5)
+    assert len(host.steps) == before
+    host.run(2.0)
+    assert len(host.steps) > before
+
+
+@pytest.mark.parametrize(("excess", "down"), [(0.05, 3), (0.2, 10), (0.5, 20)])
+def test_as_many_step_down_at_once_as_have_to_share_a_tail_for_the_rest_to_be_in_time(excess, down):
+    """Each takes a twentieth of it all, and sharing saves two fifths of that."""
+    demand = THRESHOLDS.relieved_busy + excess
+    names = {"shared": 1.0, "own": 2.0}
+    levels = tuple(QualityLevel(name=name, field="any", shared_tail=name == "shared") for name in names)
+    steps = Offer(levels, names).steps(AUTO, block_s=BLOCK_S)
+    before = next(at for at, step in enumerate(steps) if step.sharing) - 1
+    sample = LoadSample(lateness=1.2, rendering=demand / 20)
+    host = Host([Ladder(steps, before)] * 20, lambda _: sample, lambda _: 1.0)
+    host.measure()
+    host.measure()
+    expected = math.ceil(excess / (0.4 * demand / 20) - 1e-9)
+    assert len(host.steps) == min(20, max(down, expected))
+
+
+def test_a_thread_that_works_off_what_piled_up_lowers_nobody():
+    host = Host([ladder(1, 2)] * 4, busy=lambda _: 1.0)
+    host.state = dataclasses.replace(host.state, thread=ThreadState(FULL_AHEAD, lateness=3.5))
+    for lateness in np.linspace(3.0, 0.0, 12).tolist():
+        host.sample = lambda _, lateness=lateness: LoadSample(lateness=lateness, rendering=0.15)
+        host.measure()
+    assert host.steps == []
+
+
+def test_blocks_that_are_late_again_and_again_keep_their_number_at_once():
+    """A load that comes every ten seconds finds too few blocks at once only twice."""
+    core, found = Core(), []
+    for _ in range(6):
+        core.run(0.4, periods=36)
+        found.append(core.ahead.blocks)
+        core.look(1.0, lateness=1.5)
+        core.run(1.0, periods=3)
+    assert found[0] == 1
+    assert min(found[2:]) > 2
+    core.run(0.4, periods=1_600)
+    assert core.ahead.blocks == 1
 
 
 def test_a_stream_does_not_rise_to_a_level_whose_responses_would_be_slow():
@@ -320,7 +389,9 @@ def test_near_a_limit_the_number_of_blocks_at_once_settles_though_load_fluctuate
 def test_the_thresholds_stand_in_an_order_that_leaves_room_between_up_and_down():
     one = THRESHOLDS
     assert one.easy < one.tight < one.late
-    assert one.free_busy < one.more_blocks_above[0] < one.more_blocks_above[-1] < one.full_busy < one.behind_busy
+    assert one.more_blocks_above[0] < one.more_blocks_above[-1] < one.full_busy < one.behind_busy
+    assert one.free_busy < one.relieved_busy < one.full_busy
+    assert one.surely_saved < one.saved_by_doubling
     assert len(one.more_blocks_above) == len(one.blocks_at_once) - 1
     assert [2 * number for number in one.blocks_at_once[:-1]] == [*one.blocks_at_once[1:]]
     assert one.settle_s < one.clear_s < one.relapse_s
