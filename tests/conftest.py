@@ -52,10 +52,10 @@ _TIMED = ("bench/", "integration/", "runtime/", "streaming/")
 
 @pytest.hookimpl(tryfirst=True, optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int | None:
-    """Half as many again as there are cores: for a quarter of the time tests wait, for browsers and for sound to pass.
+    """Twice as many as there are cores: for a third of the time tests wait, for browsers and for sound to pass.
     PYTEST_XDIST_AUTO_NUM_WORKERS says otherwise."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return None if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ else cores + (cores + 1) // 2
+    return None if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ else 2 * cores
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -314,10 +314,11 @@ def filters(hrtfs) -> HeadFilters:
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[str]:
-    """Address of `nafir serve` with its own scenes, for all tests of the page that leave it as it was."""
+    """Address of `nafir serve` with two of its scenes, for all tests of the page that leave it as it was."""
     from tests import visitor  # without playwright, importing it skips what asks for it
 
-    with visitor.serving(visitor.free_port()) as url:
+    scenes = ("apartment", "open-field")
+    with visitor.serving(visitor.free_port(), scenes=scenes, costs_after_s=5.0) as url:
         yield url
 
 

@@ -7,6 +7,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
 import uvicorn
 
 from server.api.app import create_app
@@ -14,6 +15,9 @@ from server.api.serving import uvicorn_options
 from server.api.settings import Settings
 from server.assets.hrtfs import HrtfLibrary
 from server.field.fields_by_level import FieldsByLevel
+
+_NEVER_S = 3600.0
+"""After this time a server measures what nothing waits for, as what effects cost."""
 
 
 @contextmanager
@@ -23,16 +27,18 @@ def serving(levels: FieldsByLevel, hrtfs: HrtfLibrary, **options: object) -> Ite
     app = create_app(settings := Settings(port=0, **options), scenes={levels.bundle.id: levels}, hrtfs=hrtfs)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", **uvicorn_options(settings)))
     thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        while not server.started:
-            time.sleep(0.02)
-        address = "{}:{}".format(*server.servers[0].sockets[0].getsockname())
-        _wait_until_ready(address)
-        yield address
-    finally:
-        server.should_exit = True
-        thread.join()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("server.api.app._COSTS_AFTER_S", _NEVER_S)
+        thread.start()
+        try:
+            while not server.started:
+                time.sleep(0.02)
+            address = "{}:{}".format(*server.servers[0].sockets[0].getsockname())
+            _wait_until_ready(address)
+            yield address
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 def _wait_until_ready(address: str) -> None:

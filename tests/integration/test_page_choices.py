@@ -28,7 +28,8 @@ def server(tmp_path_factory):
         middle = file["Data.IR"][:].mean(axis=1)
         file["Data.IR"][:] = middle[:, None] * (1 + 0.9 * to_left[:, None] * np.array([1, -1]))[..., None]
     settings = {"NAFIR_MAX_EMITTERS": str(MOST_SOURCES)}
-    with serving(free_port(), "--hrtf", str(lopsided), settings=settings) as url:
+    scenes = ("apartment", "open-field")
+    with serving(free_port(), "--hrtf", str(lopsided), scenes=scenes, settings=settings) as url:
         yield url
 
 

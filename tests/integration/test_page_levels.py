@@ -37,7 +37,7 @@ def several_levels(tmp_path_factory) -> Iterator[str]:
     files = {name: (apartment.folder / name).read_bytes() for name in manifest.files}
     folder = tmp_path_factory.mktemp("scenes") / "apartment"
     write_bundle(folder, manifest, files)
-    with serving(free_port(), "--bundle", str(folder)) as url:
+    with serving(free_port(), "--bundle", str(folder), scenes=(), costs_after_s=5.0) as url:
         yield url
 
 

@@ -10,7 +10,7 @@ pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
 @pytest.fixture(scope="module")
 def page(browser, measured_bundle):
-    with visitor.serving(visitor.free_port(), "--bundle", str(measured_bundle.folder)) as url:
+    with visitor.serving(visitor.free_port(), "--bundle", str(measured_bundle.folder), scenes=()) as url:
         context = browser.new_context(viewport={"width": 1280, "height": 800})
         complaints: list[str] = []
         context.on("weberror", lambda error: complaints.append(str(error.error)))

@@ -35,7 +35,7 @@ def test_a_stream_goes_on_with_what_was_changed_meanwhile(browser):
         page.click("#add-source")
         assert page.evaluate("nafir.state().emitters.length") == 2
         with passing_on(port, server):
-            page.wait_for_function(IS_LIVE, timeout=20_000)
+            page.wait_for_function(IS_LIVE, timeout=visitor.WAIT_MS)
             assert resumptions(server, "resumed") == 1
             # The plan knows the source that came while there was no connection.
             page.wait_for_function("nafir.state().effects?.decisions.some(({ emitter }) => emitter === 'B')")
@@ -59,7 +59,7 @@ def test_a_stream_of_a_server_that_was_started_anew_begins_anew(browser):
         start(page)
     page.wait_for_function(IS_WAITING)
     with serving(port, settings=LONG) as url:
-        page.wait_for_function(IS_LIVE, timeout=20_000)
+        page.wait_for_function(IS_LIVE, timeout=visitor.WAIT_MS)
         assert resumptions(url, "unknown") == 1
         page.evaluate("nafir.setListener({ yaw: 1 })")
         assert np.all(level_db(listen(page)) > -70)

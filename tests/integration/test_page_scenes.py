@@ -11,7 +11,14 @@ from tests.visitor import level_db, listen, start
 browser = visitor.browser
 pytestmark = [*visitor.needs_browser, pytest.mark.untimed]
 
-SCENES = [folder.name for folder in bundled_scenes()]
+SCENES = tuple(folder.name for folder in bundled_scenes())
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A server of all of them."""
+    with visitor.serving(visitor.free_port(), scenes=SCENES, costs_after_s=5.0) as url:
+        yield url
 
 
 @pytest.fixture
@@ -32,7 +39,7 @@ def test_every_bundled_scene_is_opened_played_and_left_by_its_menu(context, serv
     page = context.new_page()  # with the usual map
     page.goto(f"{server}/?scene={SCENES[0]}")
     page.evaluate("nafir.ready")
-    for scene, following in zip(SCENES, [*SCENES[1:], SCENES[0]], strict=True):
+    for scene, following in zip(SCENES, (*SCENES[1:], SCENES[0]), strict=True):
         assert page.input_value("#scene-choice") == scene
         start(page)
         page.wait_for_function("nafir.state().level !== null && nafir.state().effects !== null")
@@ -72,7 +79,7 @@ def test_a_part_that_fails_leaves_the_rest_as_it_is(context, server, part, answe
     assert page.locator("#scene-choice").is_visible()
     assert page.locator("#marks .listener").is_visible()
     page.click("#play")
-    page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
+    page.wait_for_function("nafir.state().connection === 'live'", timeout=visitor.WAIT_MS)
     assert page.locator("#connection-text").inner_text() == "Live"
 
 
@@ -89,8 +96,8 @@ def test_clips_and_frontier_appear_once_the_server_answers(context, server):
     page = open_scene(context, server, SCENES[0])
     page.wait_for_function("document.getElementById('level-note').textContent.includes('not now')")
     failing["is"] = False
-    page.wait_for_function("nafir.state().emitters.length === 1", timeout=20_000)
-    page.wait_for_function("!document.getElementById('level-choice').disabled", timeout=20_000)
+    page.wait_for_function("nafir.state().emitters.length === 1", timeout=visitor.WAIT_MS)
+    page.wait_for_function("!document.getElementById('level-choice').disabled", timeout=visitor.WAIT_MS)
 
 
 def test_a_scene_that_cannot_be_had_leaves_the_menu_that_leads_out(context, server):

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from server.scene.bundle import BUNDLED
 from tests import visitor
 from tests.directional_flat import write_directional
 from tests.visitor import free_port, level_db, listen, open_page, serving, start
@@ -21,7 +20,7 @@ def server(tmp_path_factory) -> Iterator[str]:
     """A server whose scene `flat` knows directions, at the page of that scene; it has the open field too."""
     folder = tmp_path_factory.mktemp("scenes") / "flat"
     write_directional(folder)
-    with serving(free_port(), "--bundle", str(folder), "--bundle", str(BUNDLED / "open-field")) as url:
+    with serving(free_port(), "--bundle", str(folder), scenes=("open-field",)) as url:
         yield f"{url}/?scene=flat"
 
 

@@ -215,7 +215,7 @@ def test_everything_is_done_by_keyboard(browser, server):
 
     page.focus("#play")
     keys.press("Enter")
-    page.wait_for_function("nafir.state().connection === 'live'", timeout=20_000)
+    page.wait_for_function("nafir.state().connection === 'live'", timeout=visitor.WAIT_MS)
 
     page.focus("#add-source")
     keys.press("Space")

@@ -34,7 +34,8 @@ def test_a_server_with_keys_shows_it_once_it_has_one_and_tries_out_with_it(brows
     page = context.new_page()
     asked = []
     page.on("request", lambda request: asked.append((request.url, request.headers.get("authorization"))))
-    with serving(free_port(), settings={"NAFIR_KEYS_FILE": str(tmp_path / "keys.json")}) as url:
+    settings = {"NAFIR_KEYS_FILE": str(tmp_path / "keys.json")}
+    with serving(free_port(), scenes=("open-field",), settings=settings) as url:
         page.goto(f"{url}/docs")
         page.wait_for_selector("#key[open]")
         assert page.locator(".opblock").count() == 0
