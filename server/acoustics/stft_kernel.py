@@ -83,7 +83,7 @@ def synthesise(frames: int, windows: Windows, total: Float32, first: int) -> Non
     """Transform eight frames back and add them to `total`, from frame `first` on. `frames` is overwritten."""
     n_fft = windows.n_fft
     hop, size = n_fft // 4, LANES * n_fft
-    transform_lanes(frames, n_fft, windows.passes.ctypes.data)
+    transform_lanes(broadcast(np.float32(0.0)), frames, n_fft, LANES, size, windows.passes.ctypes.data)
     window = windows.synthesis.ctypes.data
     places = windows.places
     for ear in range(2):
@@ -128,7 +128,9 @@ def synthesise_next(frames: int, windows: Windows, carried: int, rows: int, to: 
 
     `carried` (hop, 2, 3, 8) keeps the sums to which the next frames will be added, and `rows` (2, 8, 8) is a buffer.
     """
-    transform_but_last(frames, windows.n_fft, windows.passes.ctypes.data)
+    n_fft = windows.n_fft
+    like = broadcast(np.float32(0.0))
+    transform_but_last(like, frames, n_fft, LANES, LANES * n_fft, windows.passes.ctypes.data)
     add_up(frames, windows, carried, rows, to, other)
 
 
@@ -137,11 +139,12 @@ def add_up(frames: int, windows: Windows, carried: int, rows: int, to: int, othe
     """Do the part of `synthesise_next` after all but the last pass of the transform."""
     hop, size = windows.n_fft // 4, LANES * windows.n_fft
     window, places = windows.synthesis.ctypes.data, windows.places.ctypes.data
+    like = broadcast(np.float32(0.0))
     for n in range(0, hop, LANES):
         for i in range(LANES):
             # The last pass gives the samples that lie a hop apart; real and imaginary parts are exchanged, because it
             # is the inverse.
-            r0, l0, r1, l1, r2, l2, r3, l3 = butterfly(frames, size, LANES * load_int(places, n + i), LANES)
+            r0, l0, r1, l1, r2, l2, r3, l3 = butterfly(like, frames, size, LANES * load_int(places, n + i), LANES)
             w0, w1 = load_broadcast(window, n + i), load_broadcast(window, hop + n + i)
             w2, w3 = load_broadcast(window, 2 * hop + n + i), load_broadcast(window, 3 * hop + n + i)
             kept = 6 * LANES * (n + i)
@@ -226,7 +229,7 @@ def analyse(frames: int, windows: Windows, total: Float32, first: int) -> None:
             store(frames, to + 40, samples[5])
             store(frames, to + 48, samples[6])
             store(frames, to + 56, samples[7])
-    transform_lanes(frames, n_fft, windows.passes.ctypes.data)
+    transform_lanes(broadcast(np.float32(0.0)), frames, n_fft, LANES, size, windows.passes.ctypes.data)
 
 
 @compiled

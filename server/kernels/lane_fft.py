@@ -1,22 +1,23 @@
-"""Eight complex Fourier transforms at once, one per lane, for compiled code.
+"""Eight or sixteen complex Fourier transforms at once, one per lane, for compiled code.
 
-`values` are (2, n, 8) float32 at an address: real parts, then imaginary parts, of n points in eight lanes. The
-transform is radix 4, decimation in frequency, in place; its output is in digit-reversed order, which callers undo when
-they move the data anyway. With real and imaginary parts exchanged in input and output it is the inverse, n times too
-large.
+`values` is the address of n points: the real parts of each begin `step` float32 after those of the one before it, and
+its imaginary parts are `imaginary` float32 after its real parts. There are as many lanes as in the vector `like`, of
+which nothing else is used. The transform is radix 4, decimation in frequency, in place; its output is in digit-reversed
+order, which callers undo when they move the data anyway. With real and imaginary parts exchanged in input and output it
+is the inverse, n times too large.
 """
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from server.kernels.compiled import compiled
 from server.kernels.simd import (
-    LANES,
     add,
-    load,
-    load_broadcast,
+    load_as,
+    load_broadcast_as,
     multiply,
     multiply_add,
     multiply_subtract,
@@ -70,75 +71,77 @@ def is_odd_power(points: int) -> bool:
 
 
 @compiled
-def transform_lanes(values: int, points: int, passes: int) -> None:
+def transform_lanes(like: Any, values: int, points: int, step: int, imaginary: int, passes: int) -> None:
     """Transform in place, forward; `passes` is the address of `twiddles(points)`."""
     if is_odd_power(points):
-        _halve(values, points, passes)
-    transform_halved(values, points, passes)
+        _halve(like, values, points, step, imaginary, passes)
+    transform_halved(like, values, points, step, imaginary, passes)
 
 
 @compiled
-def transform_halved(values: int, points: int, passes: int) -> None:
+def transform_halved(like: Any, values: int, points: int, step: int, imaginary: int, passes: int) -> None:
     """Do the part of `transform_lanes` after the pass of radix 2, if there is one."""
-    _turned_passes(values, points, passes)
-    size = LANES * points
+    _turned_passes(like, values, points, step, imaginary, passes)
     if first_span(points) == 0:
         return
-    for at in range(0, size, 4 * LANES):
-        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values, size, at, LANES)
+    for at in range(0, step * points, 4 * step):
+        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(like, values, imaginary, at, step)
         store(values, at, y0r)
-        store(values, size + at, y0i)
-        store(values, at + 8, y1r)
-        store(values, size + at + 8, y1i)
-        store(values, at + 16, y2r)
-        store(values, size + at + 16, y2i)
-        store(values, at + 24, y3r)
-        store(values, size + at + 24, y3i)
+        store(values, imaginary + at, y0i)
+        store(values, at + step, y1r)
+        store(values, imaginary + at + step, y1i)
+        store(values, at + 2 * step, y2r)
+        store(values, imaginary + at + 2 * step, y2i)
+        store(values, at + 3 * step, y3r)
+        store(values, imaginary + at + 3 * step, y3i)
 
 
 @compiled
-def transform_but_last(values: int, points: int, passes: int) -> None:
+def transform_but_last(like: Any, values: int, points: int, step: int, imaginary: int, passes: int) -> None:
     """Do all passes except the last, whose butterflies each combine four neighbours without twiddles."""
     if is_odd_power(points):
-        _halve(values, points, passes)
-    _turned_passes(values, points, passes)
+        _halve(like, values, points, step, imaginary, passes)
+    _turned_passes(like, values, points, step, imaginary, passes)
 
 
 @compiled
-def _turned_passes(values, points, passes) -> None:
+def _turned_passes(like, values, points, step, imaginary, passes) -> None:
     """Do the radix-4 passes except the last."""
-    size = LANES * points
+    size = step * points
     table = points if is_odd_power(points) else 0
     span = first_span(points)
     while span > 1:
         for j in range(span):
             # A range with this step would need a division to find its length.
-            at = LANES * j
+            at = step * j
             while at < size:
-                _turned_butterfly(values, size, at, LANES * span, passes, table + 6 * j)
-                at += 4 * LANES * span
+                _turned_butterfly(like, values, imaginary, at, step * span, passes, table + 6 * j)
+                at += 4 * step * span
         table += 6 * span
         span //= 4
 
 
 @compiled
-def _halve(values, points, passes) -> None:
+def _halve(like, values, points, step, imaginary, passes) -> None:
     """Do the pass of radix 2."""
-    size, half = LANES * points, points // 2
+    half = points // 2
     for j in range(half):
-        at, to = 8 * j, 8 * (j + half)
-        ar, ai, br, bi = load(values, at), load(values, size + at), load(values, to), load(values, size + to)
+        at, to = step * j, step * (j + half)
+        ar, ai = load_as(like, values, at), load_as(like, values, imaginary + at)
+        br, bi = load_as(like, values, to), load_as(like, values, imaginary + to)
         store(values, at, add(ar, br))
-        store(values, size + at, add(ai, bi))
-        store_turned(values, size, to, subtract(ar, br), subtract(ai, bi), passes, 2 * j)
+        store(values, imaginary + at, add(ai, bi))
+        store_turned(values, imaginary, to, subtract(ar, br), subtract(ai, bi), passes, 2 * j)
 
 
 @compiled
-def butterfly(values: int, size: int, at: int, step: int):
+def butterfly(like: Any, values: int, imaginary: int, at: int, step: int):
     """Transform four points that are `step` apart; returns the real and imaginary part of each."""
     p1, p2, p3 = at + step, at + 2 * step, at + 3 * step
-    ar, ai, br, bi = load(values, at), load(values, size + at), load(values, p1), load(values, size + p1)
-    cr, ci, dr, di = load(values, p2), load(values, size + p2), load(values, p3), load(values, size + p3)
+    ar, ai = load_as(like, values, at), load_as(like, values, imaginary + at)
+    br, bi = load_as(like, values, p1), load_as(like, values, imaginary + p1)
+    cr, ci = load_as(like, values, p2), load_as(like, values, imaginary + p2)
+    dr, di = load_as(like, values, p3), load_as(like, values, imaginary + p3)
     er, ei, fr, fi = add(ar, cr), add(ai, ci), subtract(ar, cr), subtract(ai, ci)
     gr, gi = add(br, dr), add(bi, di)
     hr, hi = subtract(bi, di), subtract(dr, br)  # -i (b - d)
@@ -155,19 +158,19 @@ def butterfly(values: int, size: int, at: int, step: int):
 
 
 @compiled
-def _turned_butterfly(values, size, at, step, passes, t) -> None:
-    y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values, size, at, step)
+def _turned_butterfly(like, values, imaginary, at, step, passes, t) -> None:
+    y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(like, values, imaginary, at, step)
     store(values, at, y0r)
-    store(values, size + at, y0i)
-    store_turned(values, size, at + step, y1r, y1i, passes, t)
-    store_turned(values, size, at + 2 * step, y2r, y2i, passes, t + 2)
-    store_turned(values, size, at + 3 * step, y3r, y3i, passes, t + 4)
+    store(values, imaginary + at, y0i)
+    store_turned(values, imaginary, at + step, y1r, y1i, passes, t)
+    store_turned(values, imaginary, at + 2 * step, y2r, y2i, passes, t + 2)
+    store_turned(values, imaginary, at + 3 * step, y3r, y3i, passes, t + 4)
 
 
 @compiled
-def store_turned(values, size, at, re, im, passes, t) -> None:
+def store_turned(values, imaginary, at, re, im, passes, t) -> None:
     """Store a point, multiplied by the twiddle factor at `t`."""
     # Loading the factors just before use keeps registers free until then.
-    c, s = load_broadcast(passes, t), load_broadcast(passes, t + 1)
+    c, s = load_broadcast_as(re, passes, t), load_broadcast_as(re, passes, t + 1)
     store(values, at, multiply_subtract(im, s, multiply(re, c)))
-    store(values, size + at, multiply_add(im, c, multiply(re, s)))
+    store(values, imaginary + at, multiply_add(im, c, multiply(re, s)))

@@ -36,15 +36,24 @@ from server.kernels.simd import (
     LANES,
     add,
     broadcast,
+    broadcast_as,
+    first_halves,
+    join,
+    lanes,
     load,
     load_broadcast,
     multiply,
     multiply_add,
     multiply_subtract,
+    second_halves,
     store,
     subtract,
     transpose,
 )
+
+_WIDE = 2 * LANES
+_pair = lanes(_WIDE)
+_load_pair, _load_twice = _pair.load, _pair.load_twice
 
 SMALLEST = LANES * LANES
 
@@ -98,6 +107,7 @@ def forward(
     imaginary n.
     """
     vectors = size // 8
+    like = broadcast(np.float32(0.0))
     if is_odd_power(vectors):
         half = size // 2
         for n in range(0, half, 8):
@@ -106,13 +116,13 @@ def forward(
             store(bins, n, add(ar, br))
             store(bins, size + n, add(ai, bi))
             store_turned(bins, size, half + n, subtract(ar, br), subtract(ai, bi), passes, n // 4)
-        transform_halved(bins, vectors, passes)
+        transform_halved(like, bins, vectors, LANES, size, passes)
     else:
         for n in range(0, size, 8):
             re, im = _twisted(first, second, n, size, twist)
             store(bins, n, re)
             store(bins, size + n, im)
-        transform_lanes(bins, vectors, passes)
+        transform_lanes(like, bins, vectors, LANES, size, passes)
     for at in range(0, size, 64):
         re, im = _load_8(bins, at, 8), _load_8(bins, size + at, 8)
         cos, sin = _load_8(lanes, at, 8), _load_8(lanes, size + at, 8)
@@ -120,6 +130,47 @@ def forward(
         re, im = _eight_points(transpose(re), transpose(im))
         _store_8(to, at // 8 * step, step, re)
         _store_8(to, imaginary + at // 8 * step, step, im)
+
+
+@compiled
+def forward_pair(
+    one: int, other: int, bins: int, to: int, step: int, size: int, twist: int, passes: int, lanes: int
+) -> None:
+    """Transform two windows at once, whose first halves (n,) are at addresses `one` and `other`, and whose second
+    halves are silent; all arrays are addresses.
+
+    For eight bins, 32 floats are written at every `step`-th float32 from `to` on: real and imaginary parts of the first
+    window, then those of the other. `bins` (4 n) is a buffer, in which imaginary parts follow the real parts of each
+    vector: if they were a power of two apart, both would need the same place in a cache.
+    """
+    vectors, half = size // 8, size // 2
+    like = join(broadcast(np.float32(0.0)), broadcast(np.float32(0.0)))
+    if is_odd_power(vectors):
+        for n in range(0, half, 8):
+            ar, ai = _twisted_pair(one, other, n, size, twist)
+            br, bi = _twisted_pair(one, other, half + n, size, twist)
+            store(bins, 4 * n, add(ar, br))
+            store(bins, 4 * n + _WIDE, add(ai, bi))
+            store_turned(bins, _WIDE, 4 * (half + n), subtract(ar, br), subtract(ai, bi), passes, n // 4)
+        transform_halved(like, bins, vectors, 2 * _WIDE, _WIDE, passes)
+    else:
+        for n in range(0, size, 8):
+            re, im = _twisted_pair(one, other, n, size, twist)
+            store(bins, 4 * n, re)
+            store(bins, 4 * n + _WIDE, im)
+        transform_lanes(like, bins, vectors, 2 * _WIDE, _WIDE, passes)
+    for at in range(0, size, 64):
+        re, im = _load_pair_8(bins, 4 * at), _load_pair_8(bins, 4 * at + _WIDE)
+        cos, sin = _load_twice_8(lanes, at), _load_twice_8(lanes, size + at)
+        re, im = _multiply_8(re, im, cos, sin)
+        re, im = _eight_points(transpose(re), transpose(im))
+        _store_pair_8(to, at // 8 * step, step, re, im)
+
+
+@compiled
+def _twisted_pair(one, other, n, size, twist):
+    windows = join(load(one, n), load(other, n))
+    return multiply(windows, _load_twice(twist, n)), multiply(windows, _load_twice(twist, size + n))
 
 
 @compiled
@@ -259,6 +310,54 @@ def _store_8(address: int, index: int, step: int, rows: Any) -> None:
 
 
 @compiled
+def _load_pair_8(address: int, index: int) -> Any:
+    step = 2 * _WIDE
+    return (
+        _load_pair(address, index),
+        _load_pair(address, index + step),
+        _load_pair(address, index + 2 * step),
+        _load_pair(address, index + 3 * step),
+        _load_pair(address, index + 4 * step),
+        _load_pair(address, index + 5 * step),
+        _load_pair(address, index + 6 * step),
+        _load_pair(address, index + 7 * step),
+    )
+
+
+@compiled
+def _load_twice_8(address: int, index: int) -> Any:
+    return (
+        _load_twice(address, index),
+        _load_twice(address, index + 8),
+        _load_twice(address, index + 16),
+        _load_twice(address, index + 24),
+        _load_twice(address, index + 32),
+        _load_twice(address, index + 40),
+        _load_twice(address, index + 48),
+        _load_twice(address, index + 56),
+    )
+
+
+@compiled
+def _store_pair_8(address: int, index: int, step: int, re: Any, im: Any) -> None:
+    """Store the real and imaginary parts of one window, and after them those of the other."""
+    _store_pair(address, index, re[0], im[0])
+    _store_pair(address, index + step, re[1], im[1])
+    _store_pair(address, index + 2 * step, re[2], im[2])
+    _store_pair(address, index + 3 * step, re[3], im[3])
+    _store_pair(address, index + 4 * step, re[4], im[4])
+    _store_pair(address, index + 5 * step, re[5], im[5])
+    _store_pair(address, index + 6 * step, re[6], im[6])
+    _store_pair(address, index + 7 * step, re[7], im[7])
+
+
+@compiled
+def _store_pair(address: int, index: int, re: Any, im: Any) -> None:
+    store(address, index, first_halves(re, im))
+    store(address, index + _WIDE, second_halves(re, im))
+
+
+@compiled
 def _multiply_8(ar: Any, ai: Any, br: Any, bi: Any) -> Any:
     return (
         (
@@ -324,7 +423,7 @@ def _four_points(ar: Any, ai: Any, br: Any, bi: Any, cr: Any, ci: Any, dr: Any, 
 @compiled
 def _eight_points(re: Any, im: Any) -> Any:
     """The transform of eight points in every lane, in order of frequency."""
-    half = broadcast(np.float32(np.sqrt(0.5)))
+    half = broadcast_as(re[0], np.float32(np.sqrt(0.5)))
     er, ei = _four_points(re[0], im[0], re[2], im[2], re[4], im[4], re[6], im[6])
     odd_r, odd_i = _four_points(re[1], im[1], re[3], im[3], re[5], im[5], re[7], im[7])
     # Multiplied by exp(-i pi k / 4): k = 1 and 3 need a rotation, k = 2 is -i.

@@ -5,9 +5,9 @@ that arrays do not overlap. The inner loops of the convolver and the decoder det
 serve, so they use vectors explicitly. A vector is an LLVM vector: of eight lanes, it is one register with AVX and two
 with SSE or NEON.
 
-`lanes` returns the functions that make vectors with a given number of lanes; all other functions take vectors of any
-size. Memory is addressed as (byte address, index of a float32); inside a compiled function, the address of an array is
-its `.ctypes.data`.
+`lanes` returns the functions that make vectors with a given number of lanes. Those whose names end in `_as` make
+vectors like another one; all other functions take vectors of any size. Memory is addressed as (byte address, index of
+a float32); inside a compiled function, the address of an array is its `.ctypes.data`.
 """
 
 import math
@@ -43,7 +43,11 @@ _LOGARITHM = [
 ]
 _ROOT_HALF_BITS = 0x3F3504F3
 """The bits of the square root of 1/2."""
+DIGEST_FACTOR = 0xFF51AFD7ED558CCD
+"""The factor of `mix_bits`, which MurmurHash3 has found to mix well (Appleby 2011)."""
 _SMALLEST_NORMAL = 2.0**-126
+_GROUP = 4
+"""Lanes within which a vector is rearranged in the fewest instructions, on every processor."""
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 
@@ -178,6 +182,37 @@ load, load_shorts, load_broadcast, broadcast = _usual[:4]
 WIDE_LANES: Final = 16 if HAS_WIDE_REGISTERS else LANES
 """The number of lanes of one register, for loops in which no lane depends on another. Where there are 32 registers of
 eight lanes, or of four, more lanes would not help."""
+
+
+@intrinsic
+def load_as(_context: Any, like: Any, _address: Any, _index: Any) -> Any:
+    """`load` of a vector that has as many lanes as `like`."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _load(builder, *args[1:], like.lanes)
+
+    return (like(like, types.int64, types.int64), generate) if _same(like) else None
+
+
+@intrinsic
+def load_broadcast_as(_context: Any, like: Any, _address: Any, _index: Any) -> Any:
+    """`load_broadcast` of a vector that has as many lanes as `like`."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        value = builder.load(_pointer(builder, *args[1:], _FLOAT, 4), align=4)
+        return _in_every_lane(builder, value, like.lanes)
+
+    return (like(like, types.int64, types.int64), generate) if _same(like) else None
+
+
+@intrinsic
+def broadcast_as(_context: Any, like: Any, _value: Any) -> Any:
+    """`broadcast` of a vector that has as many lanes as `like`."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _in_every_lane(builder, args[1], like.lanes)
+
+    return (like(like, types.float32), generate) if _same(like) else None
 
 
 # Other functions that read memory.
@@ -381,6 +416,53 @@ def swap_halves(_context: Any, x: Any) -> Any:
 
 
 @intrinsic
+def join(_context: Any, a: Any, b: Any) -> Any:
+    """A vector of twice as many lanes: those of `a`, then those of `b`."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return _shuffle(builder, *args, list(range(2 * a.lanes)))
+
+    return (Vector(2 * a.lanes)(a, b), generate) if _same(a, b) else None
+
+
+@intrinsic
+def first_halves(_context: Any, a: Any, b: Any) -> Any:
+    """The first halves of two vectors, one after the other."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        half = a.lanes // 2
+        return _shuffle(builder, *args, [*range(half), *range(a.lanes, a.lanes + half)])
+
+    return (a(a, b), generate) if _same(a, b) else None
+
+
+@intrinsic
+def second_halves(_context: Any, a: Any, b: Any) -> Any:
+    """The second halves of two vectors, one after the other."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        half = a.lanes // 2
+        return _shuffle(builder, *args, [*range(half, a.lanes), *range(a.lanes + half, 2 * a.lanes)])
+
+    return (a(a, b), generate) if _same(a, b) else None
+
+
+@intrinsic
+def mix_bits(_context: Any, digest: Any, words: Any) -> Any:
+    """A step of a digest, for the bits of each two lanes as an int64: `digest` is combined with `words`, and multiplied
+    by an odd number; then its upper half is combined with its lower one. For given words each step is invertible."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        kind = ir.VectorType(_INT64, digest.lanes // 2)
+        old, word = (builder.bitcast(value, kind) for value in args)
+        factor, half = (ir.Constant(kind, [value] * kind.count) for value in (DIGEST_FACTOR, 32))
+        new = builder.mul(builder.xor(old, word), factor)
+        return builder.bitcast(builder.xor(new, builder.lshr(new, half)), args[0].type)
+
+    return (digest(digest, words), generate) if _same(digest, words) else None
+
+
+@intrinsic
 def square_root(_context: Any, x: Any) -> Any:
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return _call(builder, "sqrt", *args)
@@ -457,12 +539,14 @@ def cosine_sine(_context: Any, x: Any) -> Any:
 
 @intrinsic
 def transpose(_context: Any, rows: Any) -> Any:
-    """Transpose a square matrix, whose rows are vectors: there must be one for each lane."""
+    """Transpose a square matrix, whose rows are vectors: there must be one for each lane. If there are fewer, lanes are
+    in groups of as many as there are rows, and the matrix of each group is transposed."""
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return context.make_tuple(builder, rows, _transposed(builder, cgutils.unpack_tuple(builder, args[0])))
 
-    return (rows(rows), generate) if _count(rows) and _count(rows) == rows.dtype.lanes else None
+    count = _count(rows)
+    return (rows(rows), generate) if count >= _GROUP and rows.dtype.lanes % count == 0 else None
 
 
 def _count(rows: Any) -> int:
@@ -473,21 +557,27 @@ def _count(rows: Any) -> int:
 def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
     """Transpose by pairing rows, then pairs of rows, and so on; up to the last steps within groups of four lanes, where
     it takes the fewest instructions."""
-    count = len(rows)
+    count, every = len(rows), rows[0].type.count
 
     def paired(a: Any, b: Any, lanes: list[int], step: int) -> list[Any]:
         """Combine two vectors: the given lanes of each, and the lanes `step` after them."""
         return [_shuffle(builder, a, b, [lane + further for lane in lanes]) for further in (0, step)]
 
-    fours = range(0, count, 4)
-    one = [lane for four in fours for lane in (four, count + four, four + 1, count + four + 1)]
-    two = [lane for four in fours for lane in (four, four + 1, count + four, count + four + 1)]
+    fours = range(0, count, _GROUP)
+    lanes = range(0, every, _GROUP)
+    one = [lane for four in lanes for lane in (four, every + four, four + 1, every + four + 1)]
+    two = [lane for four in lanes for lane in (four, four + 1, every + four, every + four + 1)]
     rows = [vector for i in range(0, count, 2) for vector in paired(rows[i], rows[i + 1], one, 2)]
     rows = [vector for i in fours for j in (0, 1) for vector in paired(rows[i + j], rows[i + j + 2], two, 2)]
-    width = 4
+    width = _GROUP
     while width < count:
         blocks = range(0, count, 2 * width)
-        lanes = [lane for block in blocks for start in (block, count + block) for lane in range(start, start + width)]
+        lanes = [
+            lane
+            for block in range(0, every, 2 * width)
+            for start in (block, every + block)
+            for lane in range(start, start + width)
+        ]
         rows = [
             _shuffle(builder, rows[i + k], rows[i + width + k], [lane + further for lane in lanes])
             for i in blocks

@@ -1,8 +1,7 @@
 """Impulse responses (IRs) in the memory layout of the compiled convolver."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
@@ -12,10 +11,11 @@ from numba import carray
 
 from server.kernels import odd_fft
 from server.kernels.array_pool import ArrayPool
+from server.kernels.cache_lines import zeros_on_lines
 from server.kernels.compiled import compiled
 from server.kernels.copying import copy
 from server.kernels.energy import energy_of
-from server.kernels.simd import load_int, pointer
+from server.kernels.simd import DIGEST_FACTOR, HAS_WIDE_REGISTERS, lanes, load_int, mix_bits, pointer, store
 from server.rendering.multiply_accumulate import filter_offset
 from server.rendering.partitions import Partitioning
 
@@ -27,9 +27,14 @@ _PER_STAGE = 3
 _PER_PLAN = 6
 _PLANS = 64
 """How many plans are kept: responses have few lengths, unless their ends are silent."""
-_SEED, _FACTOR = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFF51AFD7ED558CCD)
-_STEP = np.uint64(0xC4CEB9FE1A85EC53)
-_SHIFT = np.uint64(32)
+_SEEDS = np.random.PCG64(0x9E3779B97F4A7C15).random_raw(4 * 8)
+_FACTOR, _SHIFT = np.uint64(DIGEST_FACTOR), np.uint64(32)
+_WORDS = 16
+"""Lanes of a digest: eight words."""
+_load_wide = lanes(_WORDS).load
+_ROOM = 7
+"""Of each sample of a partition, numbers in a buffer: four of a transform of two channels, one of silence, and one for
+each of two channels that end within the partition."""
 _POOL = ArrayPool(64 * 1024 * 1024)
 """Enough for a few dozen responses of one second: an exchanged response frees the memory that the next one needs."""
 
@@ -38,18 +43,42 @@ def address(array: npt.NDArray[np.generic]) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-@dataclass(frozen=True)
 class PackedFilter:
     """An IR (channel, sample) transformed for every stage. Immutable, so threads may share it.
 
     `header` holds, per stage, the address of its spectra, how many partitions they have, and the address of the digests
-    of the partitions' samples. `energies` are the sums of squares of each stage's samples, over all channels.
+    of the partitions' samples. `energies` are the sums of squares of each stage's samples, over all channels. The first
+    `made` stages are in `floats` and `numbers`, as the plan has it, and the others those of `like`.
     """
 
-    header: IntArray
-    spectra: tuple[FloatArray, ...]
-    digests: tuple[IntArray, ...]
-    energies: tuple[float, ...]
+    def __init__(
+        self,
+        plan: "_Plan",
+        floats: FloatArray,
+        numbers: IntArray,
+        energies: tuple[float, ...],
+        like: "PackedFilter | None" = None,
+    ) -> None:
+        self.header = numbers[plan.header]
+        self.energies = energies
+        self._plan, self._floats, self._numbers = plan, floats, numbers
+        if like is not None:
+            made = len(energies)
+            self.header[_PER_STAGE * made :] = like.header[_PER_STAGE * made :]
+            self.energies += like.energies[made:]
+            # Now, so that `like` itself is not kept, nor what it was like.
+            self.spectra += like.spectra[made:]
+            self.digests += like.digests[made:]
+
+    @cached_property
+    def spectra(self) -> tuple[FloatArray, ...]:
+        """The spectra of each stage."""
+        return tuple([self._floats[part] for part in self._plan.spectra])
+
+    @cached_property
+    def digests(self) -> tuple[IntArray, ...]:
+        """The digests of each stage's partitions."""
+        return tuple([self._numbers[part] for part in self._plan.digests])
 
     @property
     def address(self) -> int:
@@ -71,31 +100,22 @@ def pack(
     # Reused stages come last.
     made = len(partitioning.stages) if like is None else sum(stage.start < same_from for stage in partitioning.stages)
     plan = _plan_of(partitioning, *ir.shape, made)
-    spectra = _POOL.floats(plan.floats)  # every value is written below
+    floats = _POOL.floats(plan.floats)  # every value is written below
     numbers, energies = np.zeros(plan.numbers, np.int64), np.zeros(made)
-    header = numbers[plan.header]
-    _pack(ir, plan.stages, spectra, header, numbers[plan.header.stop :], energies)
-    of_stages = PackedFilter(
-        header,
-        tuple([spectra[part] for part in plan.spectra]),
-        tuple([numbers[part] for part in plan.digests]),
-        tuple(energies.tolist()),
-    )
-    if like is None:
-        return of_stages
-    header[_PER_STAGE * made :] = like.header[_PER_STAGE * made :]
-    return PackedFilter(
-        header,
-        of_stages.spectra + like.spectra[made:],
-        of_stages.digests + like.digests[made:],
-        of_stages.energies + like.energies[made:],
-    )
+    try:
+        room = plan.rooms.pop()
+    except IndexError:
+        room = zeros_on_lines(plan.room)
+    _pack(ir, plan.stages, room, floats, numbers, plan.header.stop, energies)
+    plan.rooms.append(room)
+    return PackedFilter(plan, floats, numbers, tuple(energies.tolist()), like)
 
 
 class _Plan(NamedTuple):
     """Where the parts of a filter are: each stage's spectra among so many `floats`, and the header and each stage's
     digests among so many `numbers`. `stages` (stage, 6) are the start of each stage, the number and size of its
-    partitions, and the addresses of its transform's tables; `tables` keep these alive."""
+    partitions, and the addresses of its transform's tables; `tables` keep these alive. `rooms` are buffers of `room`
+    floats that no thread uses now."""
 
     floats: int
     numbers: int
@@ -104,6 +124,8 @@ class _Plan(NamedTuple):
     digests: tuple[slice, ...]
     stages: IntArray
     tables: tuple[odd_fft.Tables, ...]
+    room: int
+    rooms: list[FloatArray]
 
 
 @lru_cache(_PLANS)
@@ -127,7 +149,15 @@ def _plan_of(partitioning: Partitioning, channels: int, samples: int, made: int)
         digests,
         np.array(rows, np.int64).reshape(made, _PER_PLAN),
         tables,
+        *_rooms(stages[-1].size if stages else 0),
     )
+
+
+@cache
+def _rooms(longest: int) -> tuple[int, list[FloatArray]]:
+    """The size of a buffer for partitions of at most `longest` samples, and those that no thread uses now: as many as
+    there were threads at once."""
+    return _ROOM * longest + _WORDS, []
 
 
 def _parts(lengths: Iterable[int], start: int = 0) -> tuple[slice, ...]:
@@ -138,61 +168,75 @@ def _parts(lengths: Iterable[int], start: int = 0) -> tuple[slice, ...]:
 
 @compiled
 def _pack(
-    ir: FloatArray, stages: IntArray, spectra: FloatArray, header: IntArray, digests: IntArray, energies: DoubleArray
+    ir: FloatArray,
+    stages: IntArray,
+    room: FloatArray,
+    spectra: FloatArray,
+    header: IntArray,
+    done: int,
+    energies: DoubleArray,
 ) -> None:
-    """Transform an IR into the `spectra` of all `stages`, one after the other, and fill their header, digests and
-    energies."""
+    """Transform an IR into the `spectra` of all `stages`, one after the other, and fill their energies and header,
+    where digests begin with number `done`. `room` is a buffer of the size of `_rooms`."""
     channels, samples = ir.shape
     longest = stages[-1, 2] if len(stages) > 0 else 0
-    room = np.zeros((4, longest), np.float32)
-    bins, silence = room.ctypes.data, room[2].ctypes.data
-    padded = room[3]
-    done, to = 0, spectra.ctypes.data
+    words, bins, silence = room.ctypes.data, room[_WORDS:].ctypes.data, room[_WORDS + 4 * longest :].ctypes.data
+    padded = room[_WORDS + 5 * longest :].reshape(2, longest)
+    in_pairs = channels // 2 * 2 if HAS_WIDE_REGISTERS else 0
+    to = spectra.ctypes.data
     for number in range(len(stages)):
         start, count, size = stages[number, 0], stages[number, 1], stages[number, 2]
         twist, passes, lanes = stages[number, 3], stages[number, 4], stages[number, 5]
         header[_PER_STAGE * number] = to
         header[_PER_STAGE * number + 1] = count
-        header[_PER_STAGE * number + 2] = digests.ctypes.data + digests.itemsize * done
+        header[_PER_STAGE * number + 2] = header.ctypes.data + header.itemsize * done
         for partition in range(count):
             begin = start + partition * size
             end = min(begin + size, samples)
-            digest = _SEED
+            digest, before = _load_wide(_SEEDS.ctypes.data, 48), 0
+            at = filter_offset(channels, size // 8, count, 0, partition)
+            step = filter_offset(channels, size // 8, count, 1, partition) - at
             for channel in range(channels):
                 first = ir[channel, begin:end].ctypes.data
                 if end < begin + size:
-                    copy(ir[channel, begin:end], padded)
-                    padded[end - begin : size] = 0
-                    first = padded.ctypes.data
+                    beyond = padded[channel % 2]
+                    copy(ir[channel, begin:end], beyond)
+                    beyond[end - begin : size] = 0
+                    first = beyond.ctypes.data
                 digest = _digest(first, size, digest)
                 energies[number] += energy_of(carray(pointer(first), (size,), np.float32))
-                at = filter_offset(channels, size // 8, count, 0, partition)
-                step = filter_offset(channels, size // 8, count, 1, partition) - at
-                odd_fft.forward(first, silence, bins, to + 4 * (at + 16 * channel), step, 8, size, twist, passes, lanes)
-            digests[done] = np.int64(digest)
+                of_channel = to + 4 * (at + 16 * channel)
+                if channel >= in_pairs:
+                    odd_fft.forward(first, silence, bins, of_channel, step, 8, size, twist, passes, lanes)
+                elif channel % 2 == 1:
+                    odd_fft.forward_pair(before, first, bins, of_channel - 64, step, size, twist, passes, lanes)
+                before = first
+            header[done] = np.int64(_folded(digest, words))
             done += 1
         to += 4 * 2 * size * count * channels
 
 
 @compiled
-def _digest(samples: int, size: int, seed: Any) -> Any:
-    """A digest of the bits of `size` samples, a multiple of 16, at an address: equal samples give equal digests, and
-    different ones do except with probability 2^-64. It takes two samples at a time into each of eight sums, every step
-    of which is invertible."""
-    a, b, c, d = seed, seed ^ _FACTOR, seed + _FACTOR, ~seed
-    e, f, g, h = a + _STEP, b + _STEP, c + _STEP, d + _STEP
-    for n in range(0, size // 2, 8):
-        a, b = _mixed(a, load_int(samples, n)), _mixed(b, load_int(samples, n + 1))
-        c, d = _mixed(c, load_int(samples, n + 2)), _mixed(d, load_int(samples, n + 3))
-        e, f = _mixed(e, load_int(samples, n + 4)), _mixed(f, load_int(samples, n + 5))
-        g, h = _mixed(g, load_int(samples, n + 6)), _mixed(h, load_int(samples, n + 7))
-    for other in (b, c, d, e, f, g, h):
-        a = (a ^ other) * _FACTOR
-        a ^= a >> _SHIFT
-    return a
+def _digest(samples: int, size: int, before: Any) -> Any:
+    """A digest (16 lanes) of the bits of `size` samples, a multiple of 64, at an address, and of what the digest
+    `before` is of: equal samples give equal digests, and different ones do except with probability 2^-64. There are
+    four sums of eight words each, since a word must wait for the one before it; every step is invertible."""
+    seeds = _SEEDS.ctypes.data
+    a, b, c, d = before, _load_wide(seeds, 0), _load_wide(seeds, 16), _load_wide(seeds, 32)
+    for n in range(0, size, 64):
+        a = mix_bits(a, _load_wide(samples, n))
+        b = mix_bits(b, _load_wide(samples, n + 16))
+        c = mix_bits(c, _load_wide(samples, n + 32))
+        d = mix_bits(d, _load_wide(samples, n + 48))
+    return mix_bits(mix_bits(mix_bits(a, b), c), d)
 
 
 @compiled
-def _mixed(digest: Any, word: int) -> Any:
-    digest = (digest ^ np.uint64(word)) * _FACTOR
-    return digest ^ (digest >> _SHIFT)
+def _folded(digest: Any, words: int) -> Any:
+    """One number for the eight of a digest, which are written to `words`."""
+    store(words, 0, digest)
+    folded = np.uint64(0)
+    for n in range(8):
+        folded = (folded ^ np.uint64(load_int(words, n))) * _FACTOR
+        folded ^= folded >> _SHIFT
+    return folded

@@ -1,5 +1,7 @@
 """Compiled transforms, one per lane, against NumPy."""
 
+from functools import cache
+
 import numba
 import numpy as np
 import pytest
@@ -16,16 +18,45 @@ from server.kernels.lane_fft import (
     transform_lanes,
     twiddles,
 )
-from server.kernels.simd import LANES, load, store
+from server.kernels.simd import LANES, broadcast, lanes, load, store
 
 ALL_POINTS = [1, 2, 4, 8, 16, 64, 128, 256, 512, 2048]
 EACH = pytest.mark.parametrize("points", ALL_POINTS)
 
 
-def lanes_of(points, seed=0):
-    """Workspace and the complex numbers (point, lane) in it."""
-    values = np.random.default_rng(seed + points).standard_normal((2, points, LANES), dtype=np.float32)
+# Points of so many lanes, whose imaginary parts follow the real parts of all points, or those of each.
+LAYOUTS = pytest.mark.parametrize(("lanes", "together"), [(8, False), (8, True), (16, False), (16, True)])
+
+
+def lanes_of(points, lanes=LANES, seed=0):
+    """Real and imaginary parts, and the complex numbers (point, lane) of which they are."""
+    values = np.random.default_rng(seed + points).standard_normal((2, points, lanes), dtype=np.float32)
     return values, complex_of(values)
+
+
+def done(transform, values, *, together):
+    """Values transformed in a layout."""
+    _, points, lanes = values.shape
+    run = in_lanes(transform, lanes)
+    passes = twiddles(points).ctypes.data
+    if together:
+        interleaved = np.ascontiguousarray(values.transpose(1, 0, 2))
+        run(interleaved.ctypes.data, points, 2 * lanes, lanes, passes)
+        return np.ascontiguousarray(interleaved.transpose(1, 0, 2))
+    values = values.copy()
+    run(values.ctypes.data, points, lanes, lanes * points, passes)
+    return values
+
+
+@cache
+def in_lanes(transform, count):
+    broadcast = lanes(count).broadcast
+
+    @numba.njit
+    def run(values, points, step, imaginary, passes):
+        transform(broadcast(np.float32(0)), values, points, step, imaginary, passes)
+
+    return run
 
 
 def complex_of(values):
@@ -60,17 +91,17 @@ def test_order_has_every_frequency_once(points):
 
 
 @EACH
-def test_transform_lanes_transforms_each_by_itself(points):
-    values, numbers = lanes_of(points)
-    transform_lanes(values.ctypes.data, points, twiddles(points).ctypes.data)
-    assert_transformed(values, numbers)
+@LAYOUTS
+def test_transform_lanes_transforms_each_by_itself(points, lanes, together):
+    values, numbers = lanes_of(points, lanes)
+    assert_transformed(done(transform_lanes, values, together=together), numbers)
 
 
 @EACH
 def test_transform_lanes_keeps_silence_and_what_is_no_number_apart(points):
     values, numbers = lanes_of(points)
     values[:, :, 3], values[:, :, 5] = 0, np.nan
-    transform_lanes(values.ctypes.data, points, twiddles(points).ctypes.data)
+    values = done(transform_lanes, values, together=False)
     assert not values[:, :, 3].any()
     assert np.isnan(values[:, :, 5]).all()
     others = [0, 1, 2, 4, 6, 7]
@@ -79,21 +110,22 @@ def test_transform_lanes_keeps_silence_and_what_is_no_number_apart(points):
 
 
 @EACH
-def test_transform_halved_does_what_is_left_after_the_pass_of_radix_2(points):
-    values, numbers = lanes_of(points)
+@LAYOUTS
+def test_transform_halved_does_what_is_left_after_the_pass_of_radix_2(points, lanes, together):
+    values, numbers = lanes_of(points, lanes)
     if np.log2(points) % 2:
         first, second = np.split(numbers, 2)
         turn = np.exp(-2j * np.pi * np.arange(points // 2) / points)[:, None]
         put(values, np.concatenate([first + second, (first - second) * turn]))
-    transform_halved(values.ctypes.data, points, twiddles(points).ctypes.data)
-    assert_transformed(values, numbers)
+    assert_transformed(done(transform_halved, values, together=together), numbers)
 
 
 @pytest.mark.parametrize("points", [points for points in ALL_POINTS if points > 2])
-def test_transform_but_last_leaves_transforms_of_four_neighbours_to_do(points):
-    values, numbers = lanes_of(points)
-    transform_but_last(values.ctypes.data, points, twiddles(points).ctypes.data)
-    put(values, np.fft.fft(complex_of(values).reshape(-1, 4, LANES), axis=1).reshape(points, LANES))
+@LAYOUTS
+def test_transform_but_last_leaves_transforms_of_four_neighbours_to_do(points, lanes, together):
+    values, numbers = lanes_of(points, lanes)
+    values = done(transform_but_last, values, together=together)
+    put(values, np.fft.fft(complex_of(values).reshape(-1, 4, lanes), axis=1).reshape(points, lanes))
     assert_transformed(values, numbers)
 
 
@@ -101,7 +133,7 @@ def test_transform_but_last_leaves_transforms_of_four_neighbours_to_do(points):
 def test_butterfly_is_the_transform_of_four_points_any_step_apart(step):
     @numba.njit
     def run(values, size, at, step, out):
-        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(values.ctypes.data, size, at, step)
+        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(broadcast(np.float32(0)), values.ctypes.data, size, at, step)
         to = out.ctypes.data
         store(to, 0, y0r)
         store(to, 8, y0i)

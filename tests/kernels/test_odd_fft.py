@@ -68,6 +68,31 @@ def test_forward_evaluates_the_polynomial_at_the_roots_of_minus_i(size):
 
 
 @pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("step", [32, 80])
+def test_forward_pair_transforms_two_windows_that_end_in_silence_to_the_bit(size, step):
+    tables = odd_fft.tables(size)
+    windows = np.stack([noise(5, 2 * size), noise(6, 2 * size)])
+    windows[:, size:] = 0
+    out, room = np.full(size // 8 * step, 7, np.float32), np.empty(4 * size, np.float32)
+    odd_fft.forward_pair(
+        address(windows[0]),
+        address(windows[1]),
+        address(room),
+        address(out),
+        step,
+        size,
+        address(tables.twist),
+        address(tables.passes),
+        address(tables.lanes),
+    )
+    rows = out.reshape(-1, step)
+    found = rows[:, :32].reshape(-1, 2, 2, 8).transpose(1, 2, 0, 3).reshape(2, 2, size)
+    for window, bins in zip(windows, found, strict=True):
+        np.testing.assert_array_equal(bins, transform(window))
+    assert (rows[:, 32:] == 7).all()
+
+
+@pytest.mark.parametrize("size", SIZES)
 def test_inverse_brings_back_the_second_half(size):
     window = noise(2, 2 * size)
     np.testing.assert_allclose(second_half(transform(window)), window[size:], atol=3e-6)

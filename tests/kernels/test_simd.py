@@ -62,6 +62,9 @@ RESULTS = (
     "cosine",
     "sine",
     "logarithm",
+    "first_halves",
+    "second_halves",
+    "mix_bits",
 )
 
 
@@ -93,6 +96,9 @@ def lane_by_lane(lanes):
             simd.store(to, 13 * size + n, cosine)
             simd.store(to, 14 * size + n, sine)
             simd.store(to, 15 * size + n, simd.logarithm(w))
+            simd.store(to, 16 * size + n, simd.first_halves(w, x))
+            simd.store(to, 17 * size + n, simd.second_halves(w, x))
+            simd.store(to, 18 * size + n, simd.mix_bits(w, x))
             flags[n // lanes] = simd.any_above(w, x)
 
     return run
@@ -121,14 +127,30 @@ def memory(lanes):
         simd.store(to, 2 * lanes, broadcast(one))
         simd.store(to, 3 * lanes, load_twice(source, at))
         simd.store(to, 4 * lanes, load_opposed(source, at))
+        like = broadcast(one)
+        simd.store(to, 5 * lanes, simd.load_as(like, source, at))
+        simd.store(to, 6 * lanes, simd.load_broadcast_as(like, source, at))
+        simd.store(to, 7 * lanes, simd.broadcast_as(broadcast(np.float32(0)), one))
 
     return run
 
 
+MADE = (
+    "load",
+    "load_broadcast",
+    "broadcast",
+    "load_twice",
+    "load_opposed",
+    "load_as",
+    "load_broadcast_as",
+    "broadcast_as",
+)
+
+
 def made_at(lanes, values, at, one=0.0):
-    out = np.empty((5, lanes), np.float32)
+    out = np.empty((len(MADE), lanes), np.float32)
     memory(lanes)(values, at, np.float32(one), out)
-    return dict(zip(("load", "load_broadcast", "broadcast", "load_twice", "load_opposed"), out, strict=True))
+    return dict(zip(MADE, out, strict=True))
 
 
 def odd_length(lanes):
@@ -203,6 +225,26 @@ def test_lanes_of_one_count_are_one_type_and_those_of_another_are_another():
 
     with pytest.raises(TypingError):
         mixed(np.float32(1))
+
+
+@EACH
+def test_load_as_is_load_of_as_many_lanes(lanes):
+    values = odd_length(lanes)
+    for at in (0, 3, values.size - lanes):
+        assert_same(made_at(lanes, values, at, LARGEST)["load_as"], values[at : at + lanes])
+
+
+@EACH
+def test_load_broadcast_as_is_load_broadcast_of_as_many_lanes(lanes):
+    values = odd_length(lanes)
+    for at in range(EDGES.size):
+        assert_same(made_at(lanes, values, at, LARGEST)["load_broadcast_as"], np.full(lanes, values[at]))
+
+
+@EACH
+def test_broadcast_as_is_broadcast_of_as_many_lanes(lanes):
+    for number in EDGES:
+        assert_same(made_at(lanes, odd_length(lanes), 0, number)["broadcast_as"], np.full(lanes, number))
 
 
 # What reads memory otherwise.
@@ -409,6 +451,46 @@ def test_swap_halves_puts_the_second_first(lanes):
     assert_same(found["swap_halves"], np.roll(a.reshape(-1, lanes), lanes // 2, axis=1).ravel())
 
 
+@EACH
+def test_first_halves_and_second_halves_are_those_of_two_vectors(lanes):
+    a, b, _, _, found = results(lanes, odd_length(lanes), odd_length(lanes)[::-1])
+    (a, b), half = (values.reshape(-1, lanes) for values in (a, b)), lanes // 2
+    assert_same(found["first_halves"], np.hstack([a[:, :half], b[:, :half]]).ravel())
+    assert_same(found["second_halves"], np.hstack([a[:, half:], b[:, half:]]).ravel())
+
+
+def test_second_halves_and_first_halves_give_two_vectors_back():
+    a, b, _, _, found = results(8, np.arange(8), np.arange(8, 16))
+    *_, back = results(8, found["first_halves"], found["second_halves"])
+    assert_same(back["first_halves"], [*a[:4], *a[4:]])
+    assert_same(back["second_halves"], [*b[:4], *b[4:]])
+
+
+@pytest.mark.parametrize("lanes", [4, 8])
+def test_join_puts_one_vector_after_the_other(lanes):
+    load = simd.lanes(lanes).load
+
+    @numba.njit
+    def run(values, out):
+        x = values.ctypes.data
+        simd.store(out.ctypes.data, 0, simd.join(load(x, lanes), load(x, 0)))
+
+    values, out = EDGES[: 2 * lanes].copy() if lanes == 4 else np.resize(EDGES, 16), np.empty(2 * lanes, np.float32)
+    run(values, out)
+    assert_same(out, np.roll(values, lanes))
+
+
+@EACH
+def test_mix_bits_multiplies_and_folds_sixty_four_bits_of_each_two_lanes(lanes):
+    rng = np.random.default_rng(4)
+    given = rng.integers(0, 2**32, (2, 6 * lanes), np.uint32)
+    given &= ~np.uint32(1 << 23)  # finite, so that no bit of what is no number is lost on the way
+    a, b, _, _, found = results(lanes, *given.view(np.float32))
+    digest, words = a.view(np.uint64), b.view(np.uint64)
+    expected = (digest ^ words) * np.uint64(simd.DIGEST_FACTOR)
+    assert_array_equal(found["mix_bits"].view(np.uint64), expected ^ expected >> np.uint64(32))
+
+
 def of_rows(lanes, rows, body):
     """A compiled function of (values, out) from text, since a tuple of so many is written out."""
     source = "def run(values, out):\n    x, y = values.ctypes.data, out.ctypes.data\n"
@@ -433,6 +515,16 @@ def test_transpose_makes_columns_of_rows(lanes):
     out = np.empty_like(values)
     of_rows(lanes, lanes, body)(values, out)
     assert_same(out, values.T)
+
+
+def test_transpose_of_fewer_rows_than_lanes_is_one_of_each_group():
+    body = "    columns = transpose(rows)\n" + "".join(
+        f"    store(y, {16 * column}, columns[{column}])\n" for column in range(8)
+    )
+    values = np.random.default_rng(5).standard_normal((8, 2, 8), dtype=np.float32)
+    out = np.empty_like(values)
+    of_rows(16, 8, body)(values, out)
+    assert_same(out, values.transpose(2, 1, 0))
 
 
 @EACH
