@@ -38,6 +38,7 @@ Float32 = npt.NDArray[np.float32]
 
 WHOLE, START, TARGETS = 0, 1, 2
 """The purposes of `decode`: a response; the start and the targets of an iteration; targets only."""
+NO_MARGIN = -1
 
 
 class Shape(NamedTuple):
@@ -138,11 +139,31 @@ def decode(
             windows,
             noise,
             purpose,
+            NO_MARGIN,
             work,
             output[row],
         )
         if purpose != TARGETS:
             _add_known(log_magnitude[row], interaural[row], start, columns, shape, windows, work, output[row])
+
+
+@compiled
+def decode_magnitudes(
+    magnitude: Float32,
+    interaural: Float32,
+    margin: int,
+    aligned: float,
+    columns: Columns,
+    shape: Shape,
+    windows: Windows,
+    noise: Float32,
+    work: Workspace,
+    response: Float32,
+) -> None:
+    """Decode one prediction as `decode` does, from magnitudes (ear, bin, frame) in place of their logarithms, where no
+    phase is known. A `margin` of frames, at least LANES, lies before the first frame and after the last of those that
+    are used; it is silent, and so is its `interaural` coherence (2, bin, frame)."""
+    _add_noise(magnitude, interaural, aligned, columns, shape, windows, noise, WHOLE, margin, work, response)
 
 
 @compiled
@@ -227,7 +248,9 @@ def _later(last, at, now, share):
 
 
 @compiled
-def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, noise, purpose, work, response) -> None:
+def _add_noise(
+    log_magnitude, interaural, aligned, columns, shape, windows, noise, purpose, margin, work, response
+) -> None:
     """Write the noise part to a response, whose old content is overwritten."""
     hop = windows.n_fft // 4
     whole, share, first, stop = delay_of(aligned, shape, hop)
@@ -238,9 +261,13 @@ def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, nois
     if purpose != TARGETS:
         silence(response, 0, at)
     if whole < 0:  # the first frames are interpolated with frames before emission
-        _compose(-LANES, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
+        _compose(
+            -LANES, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, margin, work
+        )
     for t in range(first, stop, LANES):
-        _compose(t, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, work)
+        _compose(
+            t, whole, share, log_magnitude, interaural, columns, shape, windows.n_fft, noise, purpose, margin, work
+        )
         if purpose != TARGETS:
             at = _sound(t * hop - shape.frame_lead, 0, end, False, True, windows, work, response)
     if purpose != TARGETS:
@@ -255,17 +282,23 @@ def _add_noise(log_magnitude, interaural, aligned, columns, shape, windows, nois
 
 
 @compiled
-def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, noise, purpose, work) -> None:
+def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, noise, purpose, margin, work) -> None:
     """Compute eight frames, from frame `t` on, of the frozen noise that fills the unknown part, as
     `server.acoustics.phase.separate` and `correlated_noise` do. The prediction is delayed by `whole` frames and a
-    `share` of one. Targets are computed too, depending on `purpose`."""
+    `share` of one. Targets are computed too, depending on `purpose`. `margin` is as in `decode_magnitudes`, or
+    NO_MARGIN for logarithms."""
     zero, one = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     undecided, most = broadcast(np.float32(UNDECIDED)), broadcast(np.float32(MOST_COHERENT))
     later = broadcast(share)
     j = t - whole
-    levels, coherences, other, step = _predicted(log_magnitude, interaural, j, columns, shape, work)
-    _find_magnitudes(levels, other, step, shape, work)
-    magnitudes = work.magnitudes.ctypes.data
+    if margin >= 0:
+        magnitudes, coherences = log_magnitude.ctypes.data + 4 * (margin + j), interaural.ctypes.data + 4 * (margin + j)
+        step, other = log_magnitude.shape[2], log_magnitude.shape[1] * log_magnitude.shape[2]
+        by_bin, by_ear = step, other
+    else:
+        levels, coherences, other, step = _predicted(log_magnitude, interaural, j, columns, shape, work)
+        _find_magnitudes(levels, other, step, shape, work)
+        magnitudes, by_bin, by_ear = work.magnitudes.ctypes.data, 2 * LANES, LANES
     is_known = -LANES < j < shape.known
     known_width, width = work.known.shape[2], work.targets.shape[2]
     heard = max(0, t)  # frames before 0 are stored at 0 and overwritten later
@@ -273,7 +306,7 @@ def _compose(t, whole, share, log_magnitude, interaural, columns, shape, n_fft, 
     for bin_ in range(shape.bins):
         at = bin_ * step
         last = work.last[bin_].ctypes.data
-        ml, mr = load(magnitudes, 2 * LANES * bin_), load(magnitudes, 2 * LANES * bin_ + LANES)
+        ml, mr = load(magnitudes, by_bin * bin_), load(magnitudes, by_bin * bin_ + by_ear)
         if purpose != WHOLE:
             targets = work.targets[bin_].ctypes.data
             store(targets, heard, _later(last, 4 * LANES, ml, later))

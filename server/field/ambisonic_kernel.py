@@ -231,22 +231,20 @@ def _gains_of(log_magnitude, mixing, log_floor, steps):
     group lacks."""
     channels, bands, columns = mixing.shape[0], log_magnitude.shape[0], log_magnitude.shape[1]
     gains = np.zeros((columns, (channels + _GROUP - 1) // _GROUP, bands * channels, _GROUP), np.float32)
+    magnitudes = np.zeros((bands, (columns + WIDE_LANES - 1) // WIDE_LANES * WIDE_LANES), np.float32)
+    for band in range(bands):
+        for column in range(columns):
+            magnitude = np.exp(log_magnitude[band, column]) - np.float32(log_floor)
+            magnitudes[band, column] = max(magnitude, np.float32(0.0))
+    for column in range(0, columns, WIDE_LANES):
+        balance(magnitudes, column)
     for column in range(columns):
-        before = magnitude = _magnitude(log_magnitude[0, column], log_floor)
         for band in range(bands):
-            after = _magnitude(log_magnitude[min(band + 1, bands - 1), column], log_floor)
-            gain = magnitude * balance(before, magnitude, after)
-            before, magnitude = magnitude, after
             for i in range(channels):
                 for j in range(channels):
-                    of_noise = gain * steps[j, band] * mixing[i, j, band, column]
+                    of_noise = magnitudes[band, column] * steps[j, band] * mixing[i, j, band, column]
                     gains[column, i // _GROUP, band * channels + j, i % _GROUP] = of_noise
     return gains
-
-
-@compiled
-def _magnitude(log_magnitude, log_floor):
-    return max(np.exp(log_magnitude) - np.float32(log_floor), np.float32(0.0))
 
 
 @compiled

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import band_weights
-from server.acoustics.geometry import LEVEL
+from server.acoustics.decoding_kernel import NO_MARGIN
 from server.field.band_tail_kernel import add_band_tail, find_band_gains
 from server.field.decoder import Decoder
 from server.field.directional_graph import LEAST_POWER, Arrivals, DirectionalGraph
 from server.field.directional_response_kernel import Buffers, Early, Hearing, Room, Tail, respond
-from server.field.directions_kernel import TURNED_SCRATCH
+from server.field.directions_kernel import turned_shape
 from server.field.graph import Spectrograms
 from server.kernels.by_reference import Reference
 from server.kernels.cache_lines import zeros_on_lines
@@ -60,6 +60,8 @@ class BandTail:
         # The fade lies before the first late column, so begin with the column before it.
         first = max(0, int(np.searchsorted(edges, self.early_frames)) - 2)
         self._early_columns = _columns_of(parameters, self.early_frames)
+        is_simple = _have_columns(parameters, self.early_frames) and parameters.known_frames == 0
+        self._margin = WIDE_LANES if is_simple else NO_MARGIN
         places = centres[first:] * codec.hop - codec.frame_lead_samples + codec.n_fft / 2
         missing = _missing(codec.window * codec.dual_window, codec.hop)
         noises, diffuse = _band_noises(graph, frozen_noise)
@@ -96,7 +98,7 @@ class BandTail:
         hearing = self._hearings.get(decoder)
         if hearing is None:
             band, share = self._graph.between_bands
-            early = Early(band, share, self._early_columns, *constants)
+            early = Early(band, share, self._early_columns, self._margin, *constants)
             hearing = self._hearings[decoder] = Reference(Hearing(self._graph.turning, early, self.parts, LEAST_POWER))
         try:
             room = self._rooms.pop()
@@ -114,16 +116,17 @@ class BandTail:
     def _new_buffers(self) -> Buffers:
         codec, bands = self._codec, len(self.parts.diffuse)
         columns = self._graph.parameters.columns
-        ears = zeros_on_lines(2, 1, 2, codec.bins, columns)
         row = -(-self._early_columns // WIDE_LANES) * WIDE_LANES
-        turning = self._graph.turning.level
+        ears = zeros_on_lines(2, 1, 2, codec.bins, columns if self._margin == NO_MARGIN else row + 2 * self._margin)
+        harmonics = self._graph.turning.level.shape[1]
+        turned = turned_shape(harmonics, bands, columns)
         return Buffers(
-            turned=zeros_on_lines(turning.size + TURNED_SCRATCH),
+            turned=zeros_on_lines(*turned),
             levels=ears[0],
             coherence=ears[1],
             no_phase=zeros_on_lines(1, 2, codec.bins, 0),
-            work=zeros_on_lines(turning.shape[1] + 1, bands, row),
-            gains=zeros_on_lines(3, bands, columns - self.parts.first),
+            work=zeros_on_lines(harmonics + 1, bands, row),
+            gains=zeros_on_lines(3, *turned[1:]),
             scratch=zeros_on_lines(2, codec.n_fft + codec.hop),
         )
 
@@ -131,25 +134,17 @@ class BandTail:
         """Add tails to responses whose first frames are decoded by NumPy."""
         codec, parts = self._codec, self.parts
         bands, columns = arrivals.log_magnitude.shape[1:]
-        gains = np.empty((3, bands, columns - parts.first), np.float32)
+        gains = np.empty((3, *turned_shape(0, bands, columns)[1:]), np.float32)
         scratch = np.empty((2, codec.n_fft + codec.hop), np.float32)
         for row, (orientation, start) in enumerate(zip(orientations, aligned, strict=True)):
-            find_band_gains(
-                arrivals.log_magnitude[row],
-                arrivals.directions[row],
-                self._graph.band_products(orientation),
-                parts.diffuse,
-                parts.steps,
-                parts.first,
-                codec.log_floor,
-                LEAST_POWER,
-                gains,
-            )
+            turned = self._graph.turned(arrivals, row, orientation)
+            products = self._graph.band_products
+            find_band_gains(turned, products, parts.diffuse, parts.steps, parts.first, LEAST_POWER, gains)
             delay = float(start) / codec.hop
             whole = math.floor(delay)
             fade_at = (whole + self.early_frames) * codec.hop - codec.frame_lead_samples
             add_band_tail(
-                gains,
+                gains[:, :, parts.first :],
                 parts.places + start,
                 parts.noises,
                 fade_at,
@@ -166,6 +161,12 @@ def _columns_of(parameters: CodecParameters, frames: int) -> int:
         return frames
     weights = parameters.frame_axis.spread()[:, :frames]
     return int(np.flatnonzero(weights.any(axis=1))[-1]) + 1
+
+
+def _have_columns(parameters: CodecParameters, frames: int) -> bool:
+    """Whether each of the first `frames` has a column of a prediction of its own."""
+    axis = parameters.frame_axis
+    return axis is None or np.array_equal(axis.edges[: frames + 1], np.arange(frames + 1))
 
 
 def _missing(product: Floats, hop: int) -> Float32:
@@ -202,7 +203,7 @@ def _band_noises(graph: DirectionalGraph, frozen_noise: Float32) -> tuple[Floats
     at_right = np.conj(coherence) * one + np.sqrt(1 - np.abs(coherence) ** 2) * other
     weights = band_weights(frequency * codec.sample_rate)
     noises = np.stack([np.fft.irfft(weights * ear, samples) for ear in (left * one, right * at_right)], axis=1)
-    of_bands = graph.band_products(np.array(LEVEL))[..., 0]
+    of_bands = graph.band_products[..., 0]
     coherent = of_bands[:, 2] / np.sqrt(of_bands[:, 0] * of_bands[:, 1])
     diffuse = np.stack([of_bands[:, 0], of_bands[:, 1], np.clip(coherent, -0.999, 0.999)], axis=-1)
     return noises, np.ascontiguousarray(diffuse, np.float32)

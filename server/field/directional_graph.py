@@ -17,10 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import OCTAVE_BANDS_HZ, band_positions, band_weights
+from server.acoustics.decoding_kernel import NO_MARGIN
 from server.acoustics.geometry import orientations_of
 from server.acoustics.sound_path import DescribedPaths
 from server.acoustics.spherical_harmonics import harmonic_count, sampled
-from server.field.directions_kernel import TURNED_SCRATCH, Turning, ears_of_directions, turn_products
+from server.field.directions_kernel import Turning, ears_of_directions, turn_arrivals, turned_shape
 from server.field.graph import INPUTS, FieldGraph, Spectrograms
 from server.field.runtime import InferenceSession
 from server.kernels.simd import WIDE_LANES
@@ -126,19 +127,16 @@ class DirectionalGraph(FieldGraph):
         harmonics = harmonic_count(self.heard_order)
         work = np.empty((harmonics + 1, len(OCTAVE_BANDS_HZ), whole), np.float32)
         band, share = self.between_bands
-        turned: Float32 | None = None
         for row, orientation in enumerate(orientations):
-            if turned is None or not np.array_equal(orientation, orientations[row - 1]):
-                turned = self._turned(orientation)
             ears_of_directions(
-                arrivals.log_magnitude[row],
-                arrivals.directions[row, : harmonics - 1],
-                turned[: codec.bins],
+                self.turned(arrivals, row, orientation),
+                self._level[: codec.bins],
                 band,
                 share,
                 codec.log_floor,
                 LEAST_POWER,
                 written,
+                NO_MARGIN,
                 work,
                 levels[row],
                 coherence[row],
@@ -149,9 +147,18 @@ class DirectionalGraph(FieldGraph):
         no_phase = np.zeros((rows, 2, codec.bins, self.parameters.known_frames), np.float32)
         return Spectrograms(levels, no_phase, no_phase, coherence)
 
-    def band_products(self, orientation: Floats) -> Float32:
-        """(band, product, k) the products of the turned head, averaged over each octave band."""
-        return self._turned(orientation)[self.parameters.codec.bins :]
+    def turned(self, arrivals: Arrivals, row: int, orientation: Floats) -> Float32:
+        """What arrives in one of the rows, in the axes of a head: see `turn_arrivals`."""
+        log_magnitude = arrivals.log_magnitude[row]
+        turned = np.empty(turned_shape(harmonic_count(self.heard_order), *log_magnitude.shape), np.float32)
+        floor = self.parameters.log_floor
+        turn_arrivals(log_magnitude, arrivals.directions[row], self.turning, orientation, floor, turned)
+        return turned
+
+    @property
+    def band_products(self) -> Float32:
+        """(band, product, k) the products of a head that looks ahead, averaged over each octave band."""
+        return self._level[self.parameters.codec.bins :]
 
     @property
     def diffuse_products(self) -> Floats:
@@ -179,13 +186,10 @@ class DirectionalGraph(FieldGraph):
     def _expected_outputs(self) -> str:
         return f"float {', '.join(self._shapes)}"
 
-    def _turned(self, orientation: Floats) -> Float32:
-        """(bin or band, product, k) the products of the turned head: of each bin, then averaged over each octave
-        band."""
-        turned = np.empty(self.turning.level.size + TURNED_SCRATCH, np.float32)
-        turn_products(self.turning, orientation, turned)
-        harmonics = harmonic_count(self.heard_order)
-        return turned[:-TURNED_SCRATCH].reshape(-1, PRODUCTS, harmonics)
+    @property
+    def _level(self) -> Float32:
+        """(bin or band, product, k) the head's products of each bin, then averaged over each octave band."""
+        return self.turning.level.reshape(-1, PRODUCTS, harmonic_count(self.heard_order))
 
     @cached_property
     def turning(self) -> Turning:

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.columns_kernel import Columns
-from server.acoustics.decoding_kernel import WHOLE, Shape, Workspace, decode
+from server.acoustics.decoding_kernel import WHOLE, Shape, Workspace, decode, decode_magnitudes
 from server.acoustics.stft_kernel import Windows
 from server.field.band_tail_kernel import add_band_tail, decoded_until, find_band_gains
-from server.field.directions_kernel import PRODUCTS, Turning, ears_of_directions, turn_products
+from server.field.directions_kernel import PRODUCTS, Turning, ears_of_directions, turn_arrivals
 from server.kernels.by_reference import Reference, value_of
 from server.kernels.compiled import compiled
 
@@ -24,11 +24,13 @@ Int16 = npt.NDArray[np.int16]
 
 class Early(NamedTuple):
     """How the first frames are decoded. Bins lie between `band` (bin,) and the next, at a `share` (bin,) of the way.
-    The first `columns` of a prediction are needed."""
+    The first `columns` of a prediction are needed. Each is one frame if there is a `margin` from 0 on, which is as in
+    `server.acoustics.decoding_kernel.decode_magnitudes`: then logarithms are left out."""
 
     band: npt.NDArray[np.int64]
     share: Float32
     columns: int
+    margin: int
     of_frames: Columns
     shape: Shape
     windows: Windows
@@ -47,9 +49,9 @@ class Tail(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Buffers of `respond`, reused between calls: `turned` products; `levels` and `coherence` (1, 2, bin, column) of
-    the ears, zeros beyond the first columns; `no_phase` (2, bin, 0); `work`, `gains` and `scratch` as their users need
-    them."""
+    """Buffers of `respond`, reused between calls: `turned` arrivals; `levels` and `coherence` (1, 2, bin, column) of
+    the ears, zeros in the margin or beyond the first columns; `no_phase` (1, 2, bin, 0); `work`, `gains` and `scratch`
+    as their users need them."""
 
     turned: Float32
     levels: Float32
@@ -94,21 +96,19 @@ def respond(
     shape, hop = early.shape, early.windows.n_fft // 4
     harmonics = turning.level.shape[1]
     rows = turning.level.shape[0] // PRODUCTS
-    products = buffers.turned[: rows * PRODUCTS * harmonics].reshape(rows, PRODUCTS, harmonics)
+    products = turning.level.reshape(rows, PRODUCTS, harmonics)
     of_bins, of_bands = products[: shape.bins], products[shape.bins :]
     for row in range(responses.shape[0]):
-        if row == 0 or _differ(orientations[row], orientations[row - 1]):
-            turn_products(turning, orientations[row], buffers.turned)
-        heard = directions[row, : harmonics - 1]
+        turn_arrivals(log_magnitude[row], directions[row], turning, orientations[row], shape.log_floor, buffers.turned)
         ears_of_directions(
-            log_magnitude[row],
-            heard,
+            buffers.turned,
             of_bins,
             early.band,
             early.share,
             shape.log_floor,
             least,
             early.columns,
+            early.margin,
             buffers.work,
             buffers.levels[0],
             buffers.coherence[0],
@@ -117,40 +117,42 @@ def respond(
         whole = math.floor(delay)
         fade_at = (whole + shape.used) * hop - shape.frame_lead
         until = decoded_until(fade_at, tail.missing, responses.shape[2])
-        decode(
-            buffers.levels,
-            buffers.no_phase,
-            buffers.no_phase,
-            buffers.coherence,
-            aligned[row : row + 1],
-            early.of_frames,
-            shape,
-            early.windows,
-            early.noise,
-            WHOLE,
-            decoding,
-            responses[row : row + 1, :, :until],
-        )
-        find_band_gains(
-            log_magnitude[row],
-            heard,
-            of_bands,
-            tail.diffuse,
-            tail.steps,
-            tail.first,
-            shape.log_floor,
-            least,
-            buffers.gains,
-        )
-        places = tail.places + aligned[row]
+        if early.margin >= 0:
+            decode_magnitudes(
+                buffers.levels[0],
+                buffers.coherence[0],
+                early.margin,
+                aligned[row],
+                early.of_frames,
+                shape,
+                early.windows,
+                early.noise,
+                decoding,
+                responses[row, :, :until],
+            )
+        else:
+            decode(
+                buffers.levels,
+                buffers.no_phase,
+                buffers.no_phase,
+                buffers.coherence,
+                aligned[row : row + 1],
+                early.of_frames,
+                shape,
+                early.windows,
+                early.noise,
+                WHOLE,
+                decoding,
+                responses[row : row + 1, :, :until],
+            )
+        find_band_gains(buffers.turned, of_bands, tail.diffuse, tail.steps, tail.first, least, buffers.gains)
         add_band_tail(
-            buffers.gains, places, tail.noises, fade_at, delay - whole, tail.missing, buffers.scratch, responses[row]
+            buffers.gains[:, :, tail.first :],
+            tail.places + aligned[row],
+            tail.noises,
+            fade_at,
+            delay - whole,
+            tail.missing,
+            buffers.scratch,
+            responses[row],
         )
-
-
-@compiled
-def _differ(one: Floats, other: Floats) -> bool:
-    is_other = False
-    for number in range(one.size):
-        is_other |= one[number] != other[number]
-    return is_other

@@ -3,26 +3,21 @@
 Axes: bands (7), bins, columns of frames, harmonics k; products as in `server.rendering.ear_products`.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.spherical_harmonics import harmonics_after_first
-from server.kernels.compiled import compiled
+from server.kernels.compiled import compiled, compiled_loosely
 from server.kernels.simd import (
-    LANES,
     WIDE_LANES,
     add,
     at_least,
-    broadcast,
     choose_below,
     divide,
     exponential,
     lanes,
-    load,
-    load_broadcast,
     logarithm,
     multiply,
     multiply_add,
@@ -41,15 +36,12 @@ _SILENT = np.float32(-80.0)
 
 PRODUCTS = 4
 """Products of two ears at each bin."""
-_PADDED = 2 * LANES
-"""Numbers in a row of a rotation: at least as many as harmonics up to the third order."""
-TURNED_SCRATCH = _PADDED
-"""Numbers after the products that `turn_products` overwrites."""
+_MOST_HARMONICS = 16
 _harmonics = compiled(harmonics_after_first)
 
 
 class Turning(NamedTuple):
-    """The products of a head that looks ahead, and what turns them. `level` (row, k) are rows of products of any kind.
+    """The products of a head, and what turns sound to its axes. `level` (row, k) are rows of products of any kind.
     `directions` (direction, 3) and `inverse` (k, direction) are as in
     `server.acoustics.spherical_harmonics.sampled`."""
 
@@ -58,63 +50,101 @@ class Turning(NamedTuple):
     inverse: Floats
 
 
+def turned_shape(harmonics: int, bands: int, columns: int) -> tuple[int, int, int]:
+    """The shape of what `turn_arrivals` writes."""
+    return 2 * harmonics, bands, -(-columns // WIDE_LANES) * WIDE_LANES
+
+
 @compiled
-def turn_products(turning: Turning, orientation: Floats, turned: Float32) -> None:
-    """Write to `turned` the products (row * k,) of a head with this orientation, for harmonics in world axes. The next
-    TURNED_SCRATCH numbers of `turned` are overwritten, too."""
-    level = turning.level
-    harmonics = level.shape[1]
-    matrix = np.zeros((harmonics, _PADDED), np.float32)
+def turn_arrivals(
+    log_magnitude: Float32,
+    directions: Float32,
+    turning: Turning,
+    orientation: Floats,
+    log_floor: float,
+    turned: Float32,
+) -> None:
+    """Write to the first k of `turned` (2 k, band, column in whole vectors of WIDE_LANES) what arrives at a head with
+    this orientation, in its own axes: magnitudes, then the harmonics of their powers from the second on, relative to
+    the first. Columns after those of the prediction become zero. The rest of `turned` is overwritten.
+
+    `log_magnitude` (band, column) and `directions` (at least k - 1, band, column) are a field's predictions, in world
+    axes. Turning them and not the products of the head is a fraction of the work: there are fewer of them.
+    """
+    harmonics, columns, whole = turning.inverse.shape[0], log_magnitude.shape[1], turned.shape[2]
+    matrix = np.empty((harmonics, harmonics), np.float32)
     _rotate(turning, orientation, matrix)
-    source, rows = matrix.ctypes.data, level.ctypes.data
-    to = turned.ctypes.data
-    # Rows are written one after the other, so that each overwrites what the one before it wrote too much.
-    for row in range(level.shape[0]):
-        first, rest = broadcast(np.float32(0.0)), broadcast(np.float32(0.0))
-        for k in range(harmonics):
-            factor = load_broadcast(rows, row * harmonics + k)
-            first = multiply_add(factor, load(source, k * _PADDED), first)
-            rest = multiply_add(factor, load(source, k * _PADDED + LANES), rest)
-        store(to, row * harmonics, first)
-        store(to, row * harmonics + LANES, rest)
+    floor, zero = _wide_of(np.float32(log_floor)), _wide_of(np.float32(0.0))
+    by_harmonic = 4 * whole * turned.shape[1]
+    for band in range(log_magnitude.shape[0]):
+        _copy_row(log_magnitude[band], columns, _SILENT, turned[harmonics, band])
+        for k in range(1, harmonics):
+            _copy_row(directions[k - 1, band], columns, np.float32(0.0), turned[harmonics + k, band])
+        to, source = turned[0, band].ctypes.data, turned[harmonics, band].ctypes.data
+        for column in range(0, whole, WIDE_LANES):
+            magnitude = subtract(exponential(_load_wide(source, column)), floor)
+            store(to, column, at_least(magnitude, zero))
+            begin, size = 1, 3
+            while begin < harmonics:
+                for row in range(begin, begin + size):
+                    total, of_row = zero, matrix[row].ctypes.data
+                    for k in range(begin, begin + size):
+                        total = multiply_add(_all_wide(of_row, k), _load_wide(source + k * by_harmonic, column), total)
+                    store(to + row * by_harmonic, column, total)
+                begin, size = begin + size, size + 2
+
+
+@compiled
+def _copy_row(values: Float32, columns: int, after: np.float32, row: Float32) -> None:
+    """Copy a row of columns, with the number `after` in those up to the next whole vector."""
+    for column in range(columns):
+        row[column] = values[column]
+    for column in range(columns, row.size):
+        row[column] = after
 
 
 @compiled
 def _rotate(turning: Turning, orientation: Floats, matrix: Float32) -> None:
-    """Write the matrix of `server.acoustics.spherical_harmonics.rotation`."""
+    """Write the parts of the matrix of `server.acoustics.spherical_harmonics.rotation` by which harmonics of one degree
+    turn into each other."""
     x, y, z, w = orientation
-    harmonics = turning.inverse.shape[0]
-    total = np.zeros((harmonics, harmonics))
-    total[0, 0] = 1.0
-    for number in range(turning.directions.shape[0]):
+    harmonics, count = turning.inverse.shape
+    turned = np.empty((_MOST_HARMONICS - 1, count))
+    for number in range(count):
         east, north, up = turning.directions[number]
-        turned = _harmonics(
+        of_direction = _harmonics(
             (1 - 2 * (y * y + z * z)) * east + 2 * (x * y + z * w) * north + 2 * (x * z - y * w) * up,
             2 * (x * y - z * w) * east + (1 - 2 * (x * x + z * z)) * north + 2 * (y * z + x * w) * up,
             2 * (x * z + y * w) * east + 2 * (y * z - x * w) * north + (1 - 2 * (x * x + y * y)) * up,
         )
-        begin = 1
-        while begin < harmonics:
-            size = 2 * int(math.sqrt(begin)) + 1
-            for row in range(begin, begin + size):
-                for column in range(begin, begin + size):
-                    total[row, column] += turned[row - 1] * turning.inverse[column, number]
-            begin += size
-    for row in range(harmonics):
-        for column in range(harmonics):
-            matrix[row, column] = total[row, column]
+        for k in range(harmonics - 1):
+            turned[k, number] = of_direction[k]
+    begin, size = 1, 3
+    while begin < harmonics:
+        for row in range(begin, begin + size):
+            for column in range(begin, begin + size):
+                matrix[row, column] = _product(turned[row - 1], turning.inverse[column])
+        begin, size = begin + size, size + 2
+
+
+@compiled_loosely
+def _product(one: Floats, other: Floats) -> float:
+    total = 0.0
+    for n in range(one.size):
+        total += one[n] * other[n]
+    return total
 
 
 @compiled
 def ears_of_directions(
-    log_magnitude: Float32,
-    directions: Float32,
+    turned: Float32,
     products: Float32,
     band: npt.NDArray[np.int64],
     share: Float32,
     log_floor: float,
     least: float,
     columns: int,
+    margin: int,
     work: Float32,
     levels: Float32,
     coherence: Float32,
@@ -122,16 +152,16 @@ def ears_of_directions(
     """Write the log magnitudes `levels` (ear, bin, column) and the `coherence` (real and imaginary, bin, column) of two
     ears.
 
-    `log_magnitude` (band, column) and `directions` (k - 1, band, column) are a field's predictions, `products` (bin,
-    product, k) those of the turned head. A bin lies between `band` (bin,) and the next, at this `share` (bin,) of the
-    way. Where directions cancel, an ear's power is `least` times that of the same sound from all directions. Only the
-    first `columns` are written and, where there is room, silence up to a whole vector. `work` is (k + 1, band, columns
-    in whole vectors of WIDE_LANES).
+    `turned` is what arrives, as `turn_arrivals` writes it, and `products` (bin, product, k) are those of the head. A
+    bin lies between `band` (bin,) and the next, at this `share` (bin,) of the way. Where directions cancel, an ear's
+    power is `least` times that of the same sound from all directions. Only the first `columns` are written and, where
+    there is room, silence up to a whole vector. With a `margin` from 0 on, `levels` are magnitudes and no logarithms,
+    and columns begin after so many others. `work` is (k + 1, band, columns in whole vectors of WIDE_LANES).
     """
     harmonics = products.shape[2]
     floor, lowest = _wide_of(np.float32(log_floor)), _wide_of(np.float32(least))
     zero, one = _wide_of(np.float32(0.0)), _wide_of(np.float32(1.0))
-    _find_powers(log_magnitude, directions, columns, floor, zero, work)
+    _find_powers(turned, columns, work)
     row, rest = work.shape[2], work[harmonics].ctypes.data
     by_band, by_harmonic = 4 * row, 4 * row * work.shape[1]
     for bin_ in range(products.shape[0]):
@@ -162,6 +192,12 @@ def ears_of_directions(
             square = multiply_add(real, real, multiply(imaginary, imaginary))
             # guard: coherence from directions is at most one
             shrunk = divide(one, square_root(at_least(square, one)))
+            if margin >= 0:
+                store(levels[0, bin_].ctypes.data, margin + column, left_size)
+                store(levels[1, bin_].ctypes.data, margin + column, right_size)
+                store(coherence[0, bin_].ctypes.data, margin + column, multiply(real, shrunk))
+                store(coherence[1, bin_].ctypes.data, margin + column, multiply(imaginary, shrunk))
+                continue
             if column + WIDE_LANES <= levels.shape[2]:
                 store(levels[0, bin_].ctypes.data, column, logarithm(add(left_size, floor)))
                 store(levels[1, bin_].ctypes.data, column, logarithm(add(right_size, floor)))
@@ -180,21 +216,18 @@ def ears_of_directions(
 
 
 @compiled
-def _find_powers(log_magnitude, directions, columns, floor, zero, work) -> None:
+def _find_powers(turned, columns, work) -> None:
     """Fill `work` (k, band, column) with the arriving powers of the first `columns` columns: first (k = 0) the power
-    itself, then its product with each of the `directions`. The other columns of the last whole vector become zero."""
-    whole = work.shape[2]
-    for number in range(log_magnitude.shape[0]):
-        power = work[0, number]
+    itself, then its product with each harmonic. The other columns of the last whole vector become zero."""
+    by_harmonic, of_work = 4 * turned.shape[1] * turned.shape[2], 4 * work.shape[1] * work.shape[2]
+    for number in range(work.shape[1]):
         for column in range(columns):
-            power[column] = log_magnitude[number, column]
-        for column in range(columns, whole):
-            power[column] = _SILENT
-        for column in range(0, whole, WIDE_LANES):
-            magnitude = at_least(subtract(exponential(_load_wide(power.ctypes.data, column)), floor), zero)
-            store(power.ctypes.data, column, multiply(magnitude, magnitude))
-        for k in range(1, directions.shape[0] + 1):
-            for column in range(columns):
-                work[k, number, column] = power[column] * directions[k - 1, number, column]
-            for column in range(columns, whole):
-                work[k, number, column] = 0
+            work[0, number, column] = turned[0, number, column] * turned[0, number, column]
+        for column in range(columns, work.shape[2]):
+            work[0, number, column] = 0
+    for number in range(work.shape[1]):
+        source, to = turned[0, number].ctypes.data, work[0, number].ctypes.data
+        for column in range(0, work.shape[2], WIDE_LANES):
+            power = _load_wide(to, column)
+            for k in range(1, work.shape[0] - 1):
+                store(to + k * of_work, column, multiply(power, _load_wide(source + k * by_harmonic, column)))

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from scipy.signal import butter, sosfilt
 
+from server.acoustics.decoding_kernel import NO_MARGIN
 from server.acoustics.geometry import Quaternion
 from server.acoustics.sound_path import PlanPathFinder
 from server.acoustics.spherical_harmonics import real_harmonics
-from server.field.band_tail import early_frames
+from server.field.band_tail import BandTail, early_frames
 from server.field.band_tail_kernel import add_band_tail
 from server.field.directional_graph import DirectionalGraph
 from server.field.field import AcousticField
@@ -90,7 +91,23 @@ def test_the_change_is_not_heard():
     around = np.s_[..., begin - 200 : begin + 800]
     step = levels_db(bands[0][around], (350, 5000), 0.005) - levels_db(stft[0][around], (350, 5000), 0.005)
     assert np.abs(step[:, 2:]).max() < 1.0
-    assert_array_equal(bands[0][:, : begin - 300], stft[0][:, : begin - 300])
+    before = np.s_[:, : begin - 300]
+    # The one decodes magnitudes, the other their logarithms.
+    assert_allclose(bands[0][before], stft[0][before], rtol=0, atol=1e-6 * np.abs(stft[0][before]).max())
+
+
+@pytest.mark.parametrize("aligned", [-300.0, -64.5, -1.25, 0.0, 63.75, 215.78, 512.0, 1000.4, 13_000.0, 20_000.0])
+def test_magnitudes_are_decoded_as_their_logarithms_are(aligned):
+    field = AcousticField.load(APARTMENT)
+    arrivals = field.graph.arrivals([LISTENER], [EMITTER])
+    heads, start = np.array([Quaternion.from_angles(0.3, 0.4, -0.2)]), np.array([aligned])
+    tail, by_logarithms = BandTail(field.graph, APARTMENT.frozen_noise), BandTail(field.graph, APARTMENT.frozen_noise)
+    assert tail._margin > NO_MARGIN
+    by_logarithms._margin = NO_MARGIN
+    decoder = field._decoder
+    found, expected = (each.responses(decoder, arrivals, heads, start).copy() for each in (tail, by_logarithms))
+    assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    assert (aligned > 14_400) == (not expected.any())
 
 
 @pytest.mark.parametrize(("share", "most"), [(0.0, 0.05), (0.3, 0.1)])

@@ -102,11 +102,18 @@ def test_energies_are_those_of_the_responses(diffuse, from_the_north):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
-@given(head=quaternions)
-def test_products_turn_with_the_head(graphs, order, head):
-    graph = graphs[order]
-    level = graph.turning.level.reshape(-1, 4, (order + 1) ** 2)
-    assert_allclose(graph._turned(np.array(head)), level @ rotation(head, order), atol=1e-5 * np.abs(level).max())
+@given(head=quaternions, seed=st.integers(0, 100))
+def test_what_arrives_turns_to_the_axes_of_the_head(graphs, order, head, seed):
+    graph, rng = graphs[order], np.random.default_rng(seed)
+    shape = 7, graph.parameters.columns
+    said = np.r_[np.ones((1, *shape)), rng.uniform(-1, 1, ((order + 1) ** 2 - 1, *shape))]
+    log_magnitude = rng.uniform(-20, 1, shape).astype(np.float32)
+    arrivals = Arrivals(log_magnitude[None], said[None, 1:].astype(np.float32))
+    found = graph.turned(arrivals, 0, np.array(head))[..., : shape[1]]
+    magnitude = np.maximum(np.exp(log_magnitude.astype(float)) - graph.parameters.log_floor, 0)
+    assert_allclose(found[0], magnitude, rtol=1e-6, atol=1e-9)
+    expected = np.einsum("jk,kbc->jbc", rotation(head, order), said)
+    assert_allclose(found[1 : len(said)], expected[1:], atol=1e-5)
 
 
 def test_remembered_arrivals_are_those_of_the_network(tmp_path, monkeypatch):
@@ -250,7 +257,7 @@ def test_bands_without_bins_of_their_own_are_heard(diffuse, rate, n_fft):
     graph = diffuse.graph.through(copy.copy(kemar(24_000)))
     vars(graph).pop("_mean_over_band", None)
     graph.parameters = graph.parameters.model_copy(update={"sample_rate": rate, "n_fft": n_fft, "hop": n_fft // 4})
-    found = graph.band_products(np.array(LEVEL))
+    found = graph.band_products
     assert np.isfinite(found).all()
     assert (found[:, :2, 0] > 0).all()
 

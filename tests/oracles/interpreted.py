@@ -77,7 +77,6 @@ def _render_by_numpy() -> None:
 
 
 def _decode_by_numpy() -> None:
-    from server.acoustics.spherical_harmonics import rotation
     from server.field import band_tail, decoder, directional_graph, gate
     from server.health.double_precision import DoubleBandTail, DoubleDirectionalGraph, DoubleGate
 
@@ -87,12 +86,6 @@ def _decode_by_numpy() -> None:
         setattr(band_tail.BandTail, name, vars(DoubleBandTail)[name])
     for name in ("at_ears", "_at_ears", "relative"):
         setattr(directional_graph.DirectionalGraph, name, vars(DoubleDirectionalGraph)[name])
-
-    def turned(graph: Any, orientation: Any) -> Any:
-        products = graph.turning.level @ rotation(orientation, graph.heard_order)
-        return products.reshape(-1, directional_graph.PRODUCTS, products.shape[-1])
-
-    directional_graph.DirectionalGraph._turned = turned  # type: ignore[method-assign]
 
 
 def _feed_networks_singles() -> None:
