@@ -450,7 +450,11 @@ class AcousticField:
         return _Told(self.graph.arrivals(listeners, emitters, paths), times)
 
     def _remembered(self, listeners: Floats, emitters: Floats) -> _Told:
-        keys = [self._state + one.tobytes() + other.tobytes() for one, other in zip(listeners, emitters, strict=True)]
+        if len(listeners) == 1:  # as most often
+            keys = [self._state + listeners.tobytes() + emitters.tobytes()]
+        else:
+            pairs = zip(listeners, emitters, strict=True)
+            keys = [self._state + one.tobytes() + other.tobytes() for one, other in pairs]
         known = [self._told.get(key) for key in keys]
         missing = [row for row, told in enumerate(known) if told is None]
         if missing:
@@ -535,7 +539,11 @@ class AcousticField:
 def _are_finite(*poses: Floats) -> bool:
     """Whether all numbers of these poses are finite. If one is not, neither is the sum of squares, which is found in a
     fifth of the time."""
-    return all(math.isfinite(np.vdot(part, part)) or bool(np.isfinite(part).all()) for part in poses)
+    return all(map(_is_finite, poses))
+
+
+def _is_finite(numbers: Floats) -> bool:
+    return math.isfinite(np.vdot(numbers, numbers)) or bool(np.isfinite(numbers).all())
 
 
 def frozen_noise(bundle: Bundle, graph: FieldGraph) -> FrozenNoise:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from server.acoustics.bands import in_filter_bands
 from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
+from server.kernels.by_reference import Reference
 from server.rendering.direct_path import NEAR_LIMIT_M
 from server.rendering.fractional_delay import sinc_table
 from server.rendering.hrtf import HeadFilters, NoHead
@@ -36,20 +37,22 @@ class StillPaths:
         self, filters: HeadFilters | NoHead, *, speed_of_sound: float, air_db_per_m: npt.NDArray[np.floating]
     ) -> None:
         orders = np.maximum(np.arange(filters.taps), 1)
-        self._tables = StillPathTables(
-            cepstra=filters.cepstra,
-            head_delays_s=filters.delays_s,
-            triangles=filters.triangulation.triangles,
-            across=filters.triangulation.across,
-            inverses=filters.triangulation.inverses,
-            band_cepstra=_band_cepstra(filters.sample_rate, filters.taps),
-            orders=orders.astype(np.float32),
-            reciprocals=(1 / orders).astype(np.float32),
-            sinc=sinc_table(),
-            air_db_per_m=in_filter_bands(air_db_per_m),
-            sample_rate=float(filters.sample_rate),
-            speed_of_sound=float(speed_of_sound),
-            nearest_m=NEAR_LIMIT_M,
+        self._tables = Reference(
+            StillPathTables(
+                cepstra=filters.cepstra,
+                head_delays_s=filters.delays_s,
+                triangles=filters.triangulation.triangles,
+                across=filters.triangulation.across,
+                inverses=filters.triangulation.inverses,
+                band_cepstra=_band_cepstra(filters.sample_rate, filters.taps),
+                orders=orders.astype(np.float32),
+                reciprocals=(1 / orders).astype(np.float32),
+                sinc=sinc_table(),
+                air_db_per_m=in_filter_bands(air_db_per_m),
+                sample_rate=float(filters.sample_rate),
+                speed_of_sound=float(speed_of_sound),
+                nearest_m=NEAR_LIMIT_M,
+            )
         )
 
     def add(

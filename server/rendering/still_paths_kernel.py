@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 import server.rendering.path_loops as loops
+from server.kernels.by_reference import Reference, value_of
 from server.kernels.compiled import compiled
 from server.kernels.copying import copy
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
@@ -41,7 +42,7 @@ class StillPathTables(NamedTuple):
 
 @compiled
 def add_still_paths(
-    tables: StillPathTables,
+    reference: Reference,
     to_head: DoubleArray,
     lengths_m: DoubleArray,
     arrivals: DoubleArray,
@@ -49,7 +50,9 @@ def add_still_paths(
     out: FloatArray,
 ) -> None:
     """Add to `out` (channel, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals
-    (path, 3), gains (path, octave band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones."""
+    (path, 3), gains (path, octave band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones.
+    `reference` refers to StillPathTables."""
+    tables = value_of(reference)
     ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)

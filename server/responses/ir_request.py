@@ -64,9 +64,10 @@ def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -
     field, direct = levels[request.level], request.direct_sound
     renderer.prepare_hearing(request.channels)
     emitters = [asked.state for asked in request.asked]
-    is_whole = all(emitter.effects.late and emitter.effects.early for emitter in emitters)
-    bakes_direct = any(emitter.effects.bakes_direct for emitter in emitters)
-    if field.kind.reuses_responses and is_whole and not bakes_direct and request.channels == 2:
+    effects = [emitter.effects for emitter in emitters]
+    is_whole = all(each.late and each.early for each in effects)
+    is_kept = field.kind.reuses_responses and is_whole and request.channels == 2
+    if is_kept and not any(each.bakes_direct for each in effects):
         early = direct.early_reflections
         kept = prepared_irs(field, levels.node_cache, early, renderer, request.listener, emitters)
         return IrResponse(request, kept)
@@ -83,7 +84,7 @@ def compute_irs(levels: FieldsByLevel, request: IrRequest, renderer: Renderer) -
                 prepared[row] = renderer.prepare(ir, like=request.asked[row].like, same_from=samples)
             else:
                 prepared[row] = renderer.prepare(ir if is_whole else _without_end(ir))
-    return IrResponse(request, tuple(prepared[row] for row in range(len(emitters))))
+    return IrResponse(request, tuple([prepared[row] for row in range(len(emitters))]))
 
 
 def composed_irs(

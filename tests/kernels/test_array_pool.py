@@ -25,6 +25,20 @@ def test_what_was_let_go_of_is_given_to_the_next_of_its_size():
     assert place(smaller) != where
 
 
+def test_what_is_given_has_the_shape_that_was_asked_for_and_not_that_of_the_last():
+    pool = ArrayPool(4 * MIB)
+    for shape in ((4, MIB // 16), (MIB // 4,), (2, 2, MIB // 16), (2, 2, MIB // 16)):
+        floats = pool.floats(*shape)
+        assert (floats.shape, floats.dtype, floats.flags.carray) == (shape, np.float32, True)
+        floats.fill(1.5)
+        where = place(floats)
+        del floats
+        octets = pool.take(MIB)
+        assert (octets.shape, octets.dtype, place(octets)) == ((MIB,), np.uint8, where)
+        assert (octets.view(np.float32) == 1.5).all()
+        del octets
+
+
 def test_an_array_is_not_let_go_of_while_a_view_is_left():
     pool = ArrayPool(4 * MIB)
     view = pool.take(MIB).view(np.float32).reshape(2, -1)[1, ::2]
