@@ -116,11 +116,11 @@ def balance(gains: Float32, column: int) -> None:
 
 @compiled
 def _lacking(one, other):
-    zero = broadcast(np.float32(0.0))
+    zero, even = broadcast(np.float32(0.0)), broadcast(np.float32(1.0))
     squares = multiply_add(one, one, multiply(other, other))
-    share = divide(squares, multiply_add(one, other, squares))
+    factor = divide(multiply(broadcast(np.float32(1.5)), squares), multiply_add(one, other, squares))
     # guard: silent bands lack nothing
-    return choose_below(zero, squares, multiply(broadcast(np.float32(1.5)), share), broadcast(np.float32(1.0)))
+    return choose_below(zero, squares, factor, even)
 
 
 @compiled
