@@ -609,7 +609,7 @@ class Connection:
                     return _busy(missed)
             first_step = steps.index(place.step) if place.step in steps else 0
             with span("open stream", {"nafir.scene": hello.scene, "nafir.is_resumed": lost is not None}):
-                stream = await self._open(hello, levels, offer, Ladder(steps, first_step), lost)
+                stream = await self._open(hello, levels, offer, Ladder(steps, first_step, let_in_at=first_step), lost)
             if stream is None or isinstance(stream, Goodbye):
                 return stream
             place.listeners = len(stream.audience.members)

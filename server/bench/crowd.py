@@ -350,6 +350,31 @@ class Crowd:
         self.walkers += [walker for walker in walkers if walker.hears_all]
         return Rush(walkers, await watching, load)
 
+    async def come_back(self, refused: Sequence[Walker], for_s: float) -> int:
+        """Have those who were refused ask again when they were told to, as often as they are refused again, for so many
+        seconds; keep those that come to hear all their emitters. Returns how often they asked."""
+        until_s, asked = time.monotonic() + for_s, 0
+
+        async def ask_again(number: int, walker: Walker) -> None:
+            nonlocal asked
+            while (wait_s := walker.retry_after_s) is not None and time.monotonic() + wait_s < until_s:
+                await asyncio.sleep(wait_s)
+                asked += 1
+                walker.close()
+                walker = await self._connect(number, self._choose_emitters())
+                walker.sounds.add_done_callback(_heed)
+                with contextlib.suppress(ConnectionError, TimeoutError):
+                    await asyncio.wait_for(asyncio.shield(walker.sounds), _PATIENCE_S)
+                if walker.hears_all:
+                    self.walkers.append(walker)
+                    return
+
+        first = len(self.walkers)
+        async with asyncio.timeout(for_s + _PATIENCE_S):
+            await asyncio.gather(*(ask_again(first + number, walker) for number, walker in enumerate(refused)))
+        await asyncio.sleep(max(0.0, until_s - time.monotonic()))
+        return asked
+
     def _choose_emitters(self) -> list[Circle]:
         return self._places.emitters(self.emitters, self._rng)
 

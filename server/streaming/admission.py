@@ -65,6 +65,8 @@ _REQUEST: Final = "request", "computations"
 _HELD_SHARE: Final = 8
 """For so many open streams one place may be held for a stream that has lost its client. So losing connections on
 purpose keeps nobody out."""
+_COMES_BACK_S = 2.0
+"""How much later than it was told a client may come back."""
 _SHOWN_EMITTERS = 16
 """Streams that came last, by which it is judged how many emitters the next will have."""
 
@@ -214,7 +216,11 @@ class Admission:
         self._announce(load)
         has_room = not self._is_on or load.streams <= 1 or self._may_rise(load, now_s)
         for thread in self._engine.threads:
-            thread.has_room_on_top = has_room
+            thread.has_room_on_top, thread.others_wait = has_room, self._is_on and self._others_wait(now_s)
+
+    def _others_wait(self, now_s: float) -> bool:
+        """Return whether clients that were refused are still to come back."""
+        return any(until_s + _COMES_BACK_S > now_s for until_s in self._refused_until_s)
 
     def load(self) -> ServerLoad:
         """Return what all streams take, those with a place but not opened yet included."""

@@ -299,6 +299,8 @@ class AudioThread:
         """Share of the last second or so in which it rendered. Any thread may read it."""
         self.has_room_on_top = True
         """Whether a stream may step up to the top of its ladder. Any thread may set it."""
+        self.others_wait = False
+        """Whether others wait to be let in. Any thread may set it."""
         self.least_blocks = 1
         """Least number of blocks at once, for newcomers whose work is still to come. Any thread may set it."""
         self._looked_s = time_s()
@@ -507,7 +509,9 @@ class AudioThread:
             stream.note_cost(period_s=period_s, saving=saved, memory=kept)
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
         samples = {stream: stream.sample_load(now_s) for stream in self._streams}
-        measurement = Measurement(now_s, busy, samples, self.least_blocks, self.has_room_on_top)
+        measurement = Measurement(
+            now_s, busy, samples, self.least_blocks, self.has_room_on_top, others_wait=self.others_wait
+        )
         state, decision = decide(self._thresholds, state, measurement)
         self._load = state.thread
         for stream, ladder in state.ladders.items():

@@ -54,13 +54,15 @@ class LoadSample:
 class Measurement(Generic[Key]):
     """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it.
     `least_blocks` is the least number of blocks at once, for newcomers whose work is still to come. Unless it
-    `has_room_on_top`, no stream steps up to the top of its ladder, from where it asks for IRs as often as it likes."""
+    `has_room_on_top`, no stream steps up to the top of its ladder, from where it asks for IRs as often as it likes.
+    While `others_wait` to be let in, none steps up above the step on which it was let in itself."""
 
     now_s: float
     busy: float
     streams: Mapping[Key, LoadSample]
     least_blocks: int = 1
     has_room_on_top: bool = True
+    others_wait: bool = False
 
     @property
     def lateness(self) -> float:
@@ -79,11 +81,13 @@ class Ladder:
     """A stream's quality steps, best first, with its present step and how it came there.
 
     `caution` multiplies the time for which load must be low before the stream steps up. `rose_s` is the time of its
-    last step up, while that may still prove to have been too early.
+    last step up, while that may still prove to have been too early. `let_in_at` is the number of the step on which it
+    was let in.
     """
 
     steps: tuple[QualityStep, ...]
     at: int = 0
+    let_in_at: int = 0
     caution: int = 1
     moved_s: float = -math.inf
     rose_s: float | None = None
@@ -392,6 +396,7 @@ def _move(
         for key, ladder in ladders.items()
         if _may_rise(thresholds, thread, ladder, now_s)
         and (measurement.has_room_on_top or ladder.at > 1)
+        and (ladder.at > ladder.let_in_at or not measurement.others_wait)
         and _has_time_above(thresholds, thread, ladder, measurement.streams[key].rendering, measurement.demand)
     ]
     if rising and not moved:

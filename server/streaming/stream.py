@@ -475,7 +475,7 @@ class Stream:
                 chosen = ChosenSteps(chosen.level, self.steps(chosen.level), 0)
         except RequestError as refusal:
             return [Error.from_refusal(refusal)]
-        self.ladder = Ladder(chosen.steps, chosen.at)
+        self.ladder = Ladder(chosen.steps, chosen.at, let_in_at=chosen.at)
         self.session.chosen_level = chosen.level
         self._restart_waits(self._time_s())
         return self.audience.set_quality(self.ladder.step, "chosen")

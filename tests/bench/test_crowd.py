@@ -195,3 +195,26 @@ def test_a_rush_asks_at_once_and_its_preparation_is_nobodys_wait():
     assert all(before_s < walker.asked_s < walker.answered_s for walker in rush.walkers)
     assert 0.0 <= rush.stall_s < 60.0
     assert rush.load > 0.0
+
+
+def test_those_who_were_refused_come_back_no_sooner_than_they_were_told_until_time_is_over():
+    asked_s: list[float] = []
+    places = Places.of(bundle_of("apartment"))
+
+    async def refuse(reader, writer):
+        asked_s.append(time.monotonic())
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\n\r\n")
+        writer.close()
+        await writer.wait_closed()
+
+    async def run():
+        async with await asyncio.start_server(refuse, "127.0.0.1", 0) as server:
+            crowd = Crowd(server.sockets[0].getsockname()[1], places, emitters=1, poses_per_s=0.0)
+            rush = await crowd.rush(3)
+            again = await crowd.come_back(rush.walkers, 1.5)
+            assert not crowd.walkers
+            return again, await crowd.come_back(rush.walkers, 0.5)
+
+    assert asyncio.run(run()) == (3, 0)
+    assert min(asked_s[3:]) - max(asked_s[:3]) > 0.9

@@ -463,12 +463,16 @@ class SimulatedServer:
         until_s: float = _NEVER,
         emitters: int = 32,
         announces: bool = True,
+        come_back_until_s: float = 0.0,
     ) -> list[Client]:
-        """Have clients come and be let in or refused; some of them say how many emitters they have."""
+        """Have clients come and be let in or refused; some of them say how many emitters they have. Those who are
+        refused come back when they were told to."""
         come = [Client(emitters, at_s + number * every_s, closed_s=until_s) for number in range(count)]
         for client in come:
             self.clients.append(client)
-            self.machine.at(self.began_s + client.opened_s, lambda client=client: self._ask(client, announces))
+            self.machine.at(
+                self.began_s + client.opened_s, lambda client=client: self._ask(client, announces, come_back_until_s)
+            )
             if until_s < _NEVER:
                 self.machine.at(self.began_s + until_s, lambda client=client: self._leave(client))
         return come
@@ -518,23 +522,29 @@ class SimulatedServer:
         walk = {name: level.walk_ms / level.miss_ms for name, level in self._levels.items()}
         return StreamKind(("simulated", 24_000, 1_024, None), BLOCK_S, render, walk)
 
-    def _ask(self, client: Client, announces: bool) -> None:
+    def _ask(self, client: Client, announces: bool, come_back_until_s: float = 0.0) -> None:
+        def refuse(refusal: Refusal) -> None:
+            client.refused, client.answered_s, client.place = refusal, min(client.answered_s, self.now_s), None
+            if self.now_s + refusal.retry_after_s < come_back_until_s:
+                again_s = self.machine.now_s + refusal.retry_after_s
+                self.machine.at(again_s, lambda: self._ask(client, announces, come_back_until_s))
+
+        def begin(missed: Refusal | None) -> None:
+            if missed is not None:
+                refuse(missed)
+                return
+            client.answered_s = min(client.answered_s, self.now_s)
+            self._open(client)
+
         steps = self._offer.steps(AUTO, block_s=BLOCK_S)
         answer = self.admission.turn_away()
         if answer is None:
             answer = self.admission.admit(self._kind, steps, client.emitters if announces else None)
         if isinstance(answer, Refusal):
-            client.refused, client.answered_s = answer, self.now_s
+            refuse(answer)
             return
         client.place, client.began_at = answer, steps.index(answer.step)
-        self.admission.await_turn(answer, lambda missed: self._take_turn(client, missed))
-
-    def _take_turn(self, client: Client, missed: Refusal | None) -> None:
-        client.answered_s = self.now_s
-        if missed is None:
-            self._open(client)
-        else:
-            client.refused, client.place = missed, None
+        self.admission.await_turn(answer, begin)
 
     def _leave(self, client: Client) -> None:
         if client.stream is not None:
@@ -543,7 +553,7 @@ class SimulatedServer:
             self.admission.leave(client.place)
 
     def _open(self, client: Client) -> None:
-        ladder = Ladder(self._offer.steps(AUTO, block_s=BLOCK_S), client.began_at)
+        ladder = Ladder(self._offer.steps(AUTO, block_s=BLOCK_S), client.began_at, let_in_at=client.began_at)
         session = SimulatedSession(ladder.step, client.emitters)
         self._by_session[session] = client
         client.stream = Stream(

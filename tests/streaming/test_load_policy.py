@@ -48,7 +48,7 @@ class Host:
 
     def __init__(self, ladders, sample=lambda _: LoadSample(), busy=lambda _: 0.0, ahead=FULL_AHEAD):
         self.state, self.now_s, self.steps = LoadState(ThreadState(ahead), dict(enumerate(ladders))), 100.0, []
-        self.sample, self.busy = sample, busy
+        self.sample, self.busy, self.others_wait = sample, busy, False
 
     @property
     def ladders(self):
@@ -57,7 +57,7 @@ class Host:
     def measure(self):
         self.now_s += PERIOD_S
         samples = {number: self.sample(number) for number in self.state.ladders}
-        measurement = Measurement(self.now_s, self.busy(self.ladders), samples)
+        measurement = Measurement(self.now_s, self.busy(self.ladders), samples, others_wait=self.others_wait)
         self.state, decision = decide(THRESHOLDS, self.state, measurement)
         self.steps += [(self.now_s, number, reason) for number, reason in decision.moved.items()]
         return decision
@@ -115,6 +115,15 @@ def test_a_load_that_ends_is_recovered_from_step_by_step():
     assert {reason for _, _, reason in host.steps} == {"recovered"}
     times = [now_s for now_s, _, _ in host.steps]
     assert min(after - before for before, after in itertools.pairwise(times)) >= 4.0
+
+
+def test_while_others_wait_to_be_let_in_nobody_rises_above_where_it_was_let_in():
+    host = Host([ladder(1, 2, 3, at=2), dataclasses.replace(ladder(1, 2, 3, at=4), let_in_at=2)])
+    host.state.ladders[0] = dataclasses.replace(host.ladders[0], let_in_at=2)
+    host.others_wait = True
+    assert [each.at for each in host.run(120).ladders] == [2, 2]
+    host.others_wait = False
+    assert [each.at for each in host.run(120).ladders] == [0, 0]
 
 
 def test_between_overloaded_and_well_nothing_moves():

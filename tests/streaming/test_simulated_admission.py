@@ -83,6 +83,19 @@ def test_of_those_who_ask_in_one_moment_most_that_fit_are_let_in_and_all_are_ans
     assert all(client.answered_s - client.opened_s < 1.0 for client in at_once.clients)
 
 
+def test_those_who_come_back_when_they_were_told_to_fill_what_is_left_and_cost_nobody_anything():
+    server = SimulatedServer(speeds=CORES["all on one fast core"], admits=True)
+    server.arrive(40, at_s=1.0, emitters=16, come_back_until_s=8.0)
+    server.run(3.0)
+    at_once = len(admitted(server))
+    server.run(9.0)
+    assert len(admitted(server)) >= 1.3 * at_once
+    assert late_share(admitted(server)) < 0.001
+    assert most_steps_down(admitted(server)) <= 0
+    # Room that was left was for them, and for nobody there to rise.
+    assert all(at >= client.began_at for client in admitted(server) for at_s, at in client.moves if at_s < 8.0)
+
+
 def test_without_admission_the_same_clients_break_the_sound():
     server = SimulatedServer(speeds=CORES["two slow cores"])
     server.arrive(60, at_s=1.0, every_s=0.02)
