@@ -47,6 +47,6 @@ func _idle(delta):
 		_told_s = _passed_s
 		var left = AudioServer.get_bus_peak_volume_left_db(0, 0)
 		var right = AudioServer.get_bus_peak_volume_right_db(0, 0)
-		print("%.2f s  left %.1f dB  right %.1f dB  pose %d  %s  underruns %d" % [_passed_s, left, right, core.heard_pose_id, core.state, core.underruns])
+		print("%.2f s  left %.1f dB  right %.1f dB  pose %d  %s  underruns %d" % [_passed_s, left, right, core.heard_pose_id, core.state, core.ears.underruns])
 	if _passed_s > float(_given.seconds):
 		quit()

@@ -52,6 +52,7 @@ int main(int count, char** words) {
     if (quantum % 10 != 0) continue;
     std::printf("%.2f s  left %.5f  right %.5f  pose %u  %s\n", quantum * kFrames / kRate, std::sqrt(energy[0] / (10 * kFrames)),
                 std::sqrt(energy[1] / (10 * kFrames)), session.heard_pose_id(), nafir::NameOf(session.state()));
+    std::fflush(stdout);  // into a pipe, too
     energy[0] = energy[1] = 0;
   }
   if (session.state() == nafir::State::kLive) {

@@ -35,6 +35,7 @@ static class UnityDriver
         {
             case "pose": return Converted(Pose(words, 0));
             case "listener": return Hex(NafirWire.Listener(uint.Parse(words[0]), Pose(words, 1)));
+            case "number": return Hex(NafirWire.Listener(7, Pose(words, 1), byte.Parse(words[0])));
             case "dry":
                 var samples = words.Skip(2).Select(Number).ToArray();
                 return Hex(NafirWire.DryBlock(words[0], uint.Parse(words[1]), samples, samples.Length));
@@ -60,6 +61,8 @@ static class UnityDriver
                     NafirWire.StopEmitter("x", 5000, 0.5f, 1000), NafirWire.StopEmitter("x", null, 0.01f), NafirWire.SetGain("x", -6, 2.5f),
                     NafirWire.SetLevel("auto"), NafirWire.Ping(9), NafirWire.Hello("flat", 0, 512, 8, pose, "fine"),
                     NafirWire.SetDoor("north \"1\"", 0.25f),
+                    NafirWire.Hello("flat", 0, 512, 8, pose, null, 3), NafirWire.AddListener("p\"2", pose, "kemar"), NafirWire.AddListener("p3", pose, null),
+                    NafirWire.RemoveListener("p3"), NafirWire.Acknowledge(7, "p\"2"),
                 });
             case "json":
                 try
@@ -72,6 +75,8 @@ static class UnityDriver
                 }
             case "play": return Play(words.Select(each => (double)Number(each)).ToArray());
             case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]));
+            case "cameras": return Cameras(words[0], words[1], words[2]);
+            case "listeners": return Listeners(words[0], words[1], words[2]);
             case "doors": return Doors(words[0], words[1]);
             case "shots": return Shots(words[0], words[1], words[2]);
             case "ending": return Ending(words[0], words[1], words[2]);
@@ -201,6 +206,124 @@ static class UnityDriver
     }
 
     static string Invariant(FormattableString text) => FormattableString.Invariant(text);
+
+    // A player, a guest near the clip, and one with a head that there is not. Says who came and went and what became of the stream, plays until
+    // it was lost and is live again, and says how loud player and guest were in half a second: before the loss, after it, after the guest was
+    // moved to the player, and after it left. Each time it waits until that is as it should be, thirty seconds at most.
+    static string Listeners(string url, string scene, string clip)
+    {
+        const double Heard = 1e-3;
+        Func<float, NafirPose> At = x => NafirPose.FromUnity(new NafirVector(x, 1.5f, 2.5f), new NafirQuaternion(0, 0.70710678f, 0, 0.70710678f));
+        int joined = 0, refused = 0, lost = 0, again = 0;
+        using (var stream = new NafirStream(url, scene, 48000, At(1), listeners: 2))
+        {
+            stream.ListenerAdded += id =>
+            {
+                Console.WriteLine($"joined {id}");
+                Interlocked.Increment(ref joined);
+            };
+            stream.ListenerRefused += (id, problem) =>
+            {
+                Console.WriteLine($"refused {id} {problem.Split(':')[0]}");
+                Interlocked.Increment(ref refused);
+            };
+            stream.StateChanged += state =>
+            {
+                Console.WriteLine($"state {state}");
+                if (state == NafirState.Waiting) Interlocked.Increment(ref lost);
+                if (state == NafirState.Live && lost > 0) Interlocked.Increment(ref again);
+            };
+            var guest = stream.AddListener("guest", At(4.5f));
+            stream.AddListener("nobody", At(3), "no such head");
+            stream.SetEmitter("source", new NafirSource { Clip = clip, Pose = At(5) });
+            var clock = Stopwatch.StartNew();
+            long played = 0;
+            var mine = new float[2 * 480];
+            var theirs = new float[2 * 480];
+            // Plays until something has happened, or for so many hundredths of a second. Returns the levels of player and guest.
+            Func<int, Func<bool>, double[]> Play = (longest, hasHappened) =>
+            {
+                double own = 0, other = 0;
+                var count = 0;
+                for (; count < longest && !hasHappened(); count++)
+                {
+                    var earlyMs = 10.0 * played++ - clock.Elapsed.TotalMilliseconds;
+                    if (earlyMs > 0) Thread.Sleep((int)Math.Ceiling(earlyMs));
+                    Array.Clear(mine, 0, mine.Length);
+                    Array.Clear(theirs, 0, theirs.Length);
+                    stream.AddTo(mine, 2);
+                    guest.AddTo(theirs, 2);
+                    own += mine.Sum(each => each * each);
+                    other += theirs.Sum(each => each * each);
+                }
+                return new[] { Math.Sqrt(own / (count * mine.Length)), Math.Sqrt(other / (count * mine.Length)) };
+            };
+            var levels = "";
+            Action<Func<double, double, bool>> Await = isSo =>
+            {
+                double[] found = null;
+                for (int tries = 0; tries < 60; tries++)
+                {
+                    found = Play(50, () => false);
+                    if (found[0] > Heard && isSo(found[0], found[1])) break;
+                }
+                levels += Invariant($" {found[0]} {found[1]}");
+            };
+            Play(3000, () => Volatile.Read(ref joined) > 0 && Volatile.Read(ref refused) > 0);
+            Await((own, other) => other > 2 * own);
+            Console.WriteLine("heard");
+            Play(3000, () => Volatile.Read(ref again) > 0);
+            Play(25, () => false); // what waited to be played
+            Await((own, other) => other > 2 * own);
+            stream.MoveListener("guest", At(1));
+            Await((own, other) => Math.Abs(other / own - 1) < 0.2);
+            stream.RemoveListener("guest");
+            Await((own, other) => other == 0);
+            var counts = stream.Statistics;
+            return $"end {stream.State} {counts.Reconnections} {counts.Resumptions}{levels}";
+        }
+    }
+
+    // Two cameras, the second near a clip. Answers with how loud each was in the second after both were heard, and the second camera after it
+    // was disabled.
+    static string Cameras(string url, string scene, string clip)
+    {
+        var camera = new NafirClient { url = url, scene = scene };
+        var second = new NafirListener { client = camera };
+        var thing = new NafirEmitter { client = camera, clip = clip };
+        camera.transform.position = new Vector3(1, 1.5f, 2.5f);
+        second.transform.position = new Vector3(4.5f, 1.5f, 2.5f);
+        thing.transform.position = new Vector3(5, 1.5f, 2.5f);
+        foreach (var each in new object[] { camera, thing }) Call(each, "OnEnable");
+        var heard = new float[2 * 480];
+        var sums = new double[3];
+        Func<object, double> Energy = of =>
+        {
+            Array.Clear(heard, 0, heard.Length);
+            Call(of, "OnAudioFilterRead", heard, 2);
+            return heard.Sum(each => each * each);
+        };
+        var clock = Stopwatch.StartNew();
+        var heardAt = 3000; // the quantum since which both are
+        for (int quantum = 0; quantum < heardAt + 200; quantum++)
+        {
+            var earlyMs = 10.0 * quantum - clock.Elapsed.TotalMilliseconds;
+            if (earlyMs > 0) Thread.Sleep((int)Math.Ceiling(earlyMs));
+            if (quantum == heardAt + 100) Call(second, "OnDisable");
+            foreach (var each in new object[] { camera, thing }) Call(each, "Update");
+            if (quantum < heardAt + 100) Call(second, "Update");
+            double own = Energy(camera), other = Energy(second);
+            if (own > 0 && other > 0) heardAt = Math.Min(heardAt, quantum);
+            if (quantum >= heardAt && quantum < heardAt + 100)
+            {
+                sums[0] += own;
+                sums[1] += other;
+            }
+            if (quantum >= heardAt + 150) sums[2] += other;
+        }
+        foreach (var each in new object[] { thing, camera }) Call(each, "OnDisable");
+        return string.Join(" ", sums.Select(each => Text((float)Math.Sqrt(each / (100 * heard.Length)))));
+    }
 
     // Shuts a door before there is a stream and opens it twice the same while there is one, then wants a door that the scene lacks. Answers
     // with how many more messages the server counts for that, its refusals, and whether the stream is live still.

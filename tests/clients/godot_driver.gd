@@ -6,6 +6,7 @@
 extends SceneTree
 
 var _checked = 0
+var _told = []
 
 
 # What a player of Godot does with frames, at a rate of its own.
@@ -41,7 +42,7 @@ func _initialize():
 	var vectors = JSON.parse(file.get_as_text()).result
 	var is_right = (
 		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
-		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _doors(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _doors(core) and _guests(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
 	)
 	print("checked %d" % _checked)
 	quit(0 if is_right else 1)
@@ -191,6 +192,97 @@ func _doors(core):
 	return _equal("anew", _said_of_doors(stream), ["kitchen=0", "attic=1"])
 
 
+# A stream with other listeners, over everything that may become of them. Prints what is said and told in each step, a line each, as
+# tests/clients/guests.py has it.
+func _guests(core):
+	var stream = core.new()
+	stream.connect("listener_added", self, "_on_listener_added")
+	stream.connect("listener_refused", self, "_on_listener_refused")
+	var pose = core.make_pose(Vector3(), Quat(0, 0, 0, 1))
+	var welcome = {"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "t"}
+	stream.add_listener("guest", pose, "kemar")
+	_print_guests(to_json(stream.first_message()))
+	stream.begin()
+	stream.receive(welcome)
+	_tell(stream)
+	stream.receive({"type": "listener_added", "id": "guest", "index": 7.0, "sample_clock": 0.0})
+	stream.step(0.02)
+	_tell(stream)
+	_hear(stream, 0, 3)
+	_hear(stream, 7, 7)
+	_hear(stream, 9, 11) # of nobody
+	_tell(stream)
+	stream.receive({"type": "level_changed", "level": "fine", "listener": "guest"})
+	_print_guests("%s %s" % [stream.level, stream.add_listener("guest", pose).level])
+	stream.add_listener("unheard", pose)
+	stream.add_listener("late", pose)
+	_tell(stream)
+	stream.lost("a cut")
+	_print_guests(to_json(stream.first_message()))
+	stream.begin()
+	var resumed = welcome.duplicate()
+	resumed["resumed"] = {
+		"handled": 2.0, "sample_clock": 5000.0, "pose_id": 0.0,
+		"listeners": [{"id": "guest", "index": 7.0}, {"id": "unheard", "index": 8.0}],
+	}
+	stream.receive(resumed)
+	_tell(stream)
+	stream.lost("another")
+	stream.begin()
+	stream.receive(welcome)
+	_tell(stream)
+	stream.receive({"type": "error", "code": "server_busy", "message": "no", "listener": "guest", "retry_after_s": 0.5})
+	stream.receive({"type": "error", "code": "unknown_hrtf", "message": "no", "listener": "late"})
+	stream.receive({"type": "error", "code": "unknown_listener", "message": "no", "listener": "unheard"})
+	_tell(stream)
+	stream.step(0.6)
+	_tell(stream)
+	stream.receive({"type": "error", "code": "unknown_message", "message": "no"})
+	_tell(stream)
+	return true
+
+
+func _on_listener_added(id):
+	_told.append("added:" + id)
+
+
+func _on_listener_refused(id, _problem):
+	_told.append("refused:" + id)
+
+
+func _hear(stream, number, sequence):
+	var data = StreamPeerBuffer.new()
+	for each in [1, 0, 2, number]:
+		data.put_u8(each)
+	data.put_u32(sequence)
+	data.put_u64(256 * sequence)
+	for each in [0, 0, 256]:
+		data.put_u32(each)
+	for _index in range(2 * 256):
+		data.put_16(0)
+	stream.receive_block(data)
+
+
+func _tell(stream):
+	for each in stream.texts:
+		var id = each.get("id", each.get("listener"))
+		_told.append("%s:%s" % [each.type, id if id != null else ""])
+	for each in stream.packets:
+		_told.append("pose:%d" % each.data_array[1])
+	stream.texts.clear()
+	stream.packets.clear()
+	_told.sort()
+	var line = ""
+	for each in _told:
+		line += each + " "
+	_print_guests(line)
+	_told.clear()
+
+
+func _print_guests(line):
+	print("guests " + line)
+
+
 # What waits to be sent of doors; it is taken out.
 func _said_of_doors(stream):
 	var said = []
@@ -247,10 +339,10 @@ func _playing(core, rate):
 				return false
 			sent += 256
 			sequence += 1
-		pace = stream.play(generator, 1.0 / 60)
+		pace = stream.ears.play(generator, 1.0 / 60)
 		owed += pace * 400
 		owed -= generator.take(int(owed)).size()
-		if not _equal("underruns at %d" % rate, stream.underruns, 0):
+		if not _equal("underruns at %d" % rate, stream.ears.underruns, 0):
 			return false
 		if abs(pace - 1.0) > 0.00201:
 			return _fail("pace", pace)

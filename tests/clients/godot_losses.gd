@@ -31,8 +31,8 @@ class Recorder:
 	func push_frame(frame):
 		queue.append(frame)
 
-	func _play(delta):
-		var pace = core.play(self, delta)
+	func _play(_player, ears, delta):
+		var pace = ears.play(self, delta)
 		var now_us = OS.get_ticks_usec()
 		if _last_us > 0:
 			_due += (now_us - _last_us) * 1e-6 * RATE * pace
@@ -87,14 +87,14 @@ func _idle(_delta):
 			_told[id] = true
 			print("emitter_added %s" % id)
 	var seconds = float(_given.seconds)
-	var waiting_s = float(core._waiting_frames + _recorder.queue.size() - _recorder.taken) / RATE
+	var waiting_s = float(core.ears.waiting_frames + _recorder.queue.size() - _recorder.taken) / RATE
 	if _recorder.played > (seconds - 1) * RATE:
 		_fullest_s = max(_fullest_s, waiting_s)
 	if _recorder.played >= seconds * RATE or _is_over:
 		_recorder.file.close()
 		var counts = core.statistics
 		print("end %s %d %d %d %.3f %.4f %d %s" % [
-			core.state.capitalize(), counts.reconnections, counts.resumptions, core.underruns, _fullest_s, counts.round_trip_s,
+			core.state.capitalize(), counts.reconnections, counts.resumptions, core.ears.underruns, _fullest_s, counts.round_trip_s,
 			core.sample_clock, core.level,
 		])
 		quit()

@@ -8,12 +8,13 @@ import pytest
 
 from server.api.api_keys import create_key
 from server.field.fields_by_level import FieldsByLevel
-from tests.clients.test_godot import needs_godot
-from tests.clients.test_godot import run as run_godot
+from tests.clients.test_godot import QUIET, needs_godot
+from tests.clients.test_godot import command as godot_command
 from tests.clients.test_unity import MONO, needs_mono
 from tests.clients.test_unity import listen as unity_listen
 from tests.clients.test_unreal import listen as unreal_listen
 from tests.clients.test_unreal import needs_compiler
+from tests.clients.vectors import CLIENTS
 from tests.serving import serving
 
 unity = unity_listen
@@ -29,35 +30,36 @@ def guarded(tmp_path_factory, bundle, hrtfs) -> Iterator[tuple[str, str]]:
         yield address, key
 
 
-def is_heard(command: Callable[[str], list[str | Path]], key: str) -> bool:
-    done = subprocess.run(command(key), capture_output=True, text=True, timeout=60, check=False)
-    return done.returncode == 0
+Command = Callable[[str, str], list[str | Path]]
+"""Of a client that listens with a key for so many seconds, and says ten times a second what became of it."""
+
+
+def assert_opens(command: Command, key: str) -> None:
+    """The key opens a stream, however long that takes. A wrong one opens none."""
+    run = {"cwd": CLIENTS.parent, "env": QUIET, "text": True}
+    with subprocess.Popen(command(key, "60"), stdout=subprocess.PIPE, **run) as process:
+        try:
+            assert any("live" in line.lower() for line in process.stdout)
+        finally:
+            process.kill()
+    wrong = command("nafir_000000000000_wrong", "1.5")
+    done = subprocess.run(wrong, capture_output=True, timeout=60, check=False, **run)
+    assert "live" not in done.stdout.lower()
 
 
 @needs_mono
 def test_unity_sends_the_key(unity, guarded):
     address, key = guarded
-
-    def command(key: str) -> list[str | Path]:
-        return [MONO, unity, address, "flat", "trumpet", "1.5", key]
-
-    assert is_heard(command, key)
-    assert not is_heard(command, "nafir_000000000000_wrong")
+    assert_opens(lambda key, seconds: [MONO, unity, address, "flat", "trumpet", seconds, key], key)
 
 
 @needs_compiler
 def test_unreal_sends_the_key(unreal, guarded):
     address, key = guarded
-
-    def command(key: str) -> list[str | Path]:
-        return [unreal, *address.split(":"), "flat", "trumpet", "0.5", key]
-
-    assert is_heard(command, key)
-    assert not is_heard(command, "nafir_000000000000_wrong")
+    assert_opens(lambda key, seconds: [unreal, *address.split(":"), "flat", "trumpet", seconds, key], key)
 
 
 @needs_godot
 def test_godot_sends_the_key(guarded):
     address, key = guarded
-    assert "live" in run_godot(address, "--seconds=1.5", f"--key={key}").stdout
-    assert "live" not in run_godot(address, "--seconds=1.5").stdout
+    assert_opens(lambda key, seconds: godot_command(address, f"--seconds={seconds}", f"--key={key}"), key)

@@ -1,5 +1,6 @@
 // Drives client_examples/unreal/Nafir for test_unreal.py: a command a line on standard input, an answer a line on standard output.
 
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <iostream>
@@ -155,6 +156,78 @@ void Doors() {
   tell();
 }
 
+// A stream with other listeners, over everything that may become of them. Answers with what is said and told in each step, a line each, as
+// tests/clients/guests.py has it.
+void Guests() {
+  nafir::Session session({});
+  std::vector<std::string> told;
+  session.on_listener_added = [&](const std::string& id) { told.push_back("added:" + id); };
+  session.on_listener_refused = [&](const std::string& id, const std::string&) { told.push_back("refused:" + id); };
+  const auto tell = [&] {
+    while (const auto message = session.Take()) {
+      const auto read = nafir::Json::Parse(message->data);
+      if (!message->is_text) {
+        told.push_back("pose:" + std::to_string(message->data[1]));
+      } else {
+        const std::string& id = (*read)["id"].Text();
+        told.push_back((*read)["type"].Text() + ":" + (id.empty() ? (*read)["listener"].Text() : id));
+      }
+    }
+    std::sort(told.begin(), told.end());
+    for (const std::string& each : told) std::cout << each << ' ';
+    std::cout << '\n';
+    told.clear();
+  };
+  const auto hear = [&](std::uint8_t number, std::uint8_t sequence) {
+    std::vector<std::uint8_t> block(28 + 4 * 256);
+    block[0] = 1;
+    block[2] = 2;
+    block[3] = number;
+    block[4] = sequence;
+    block[9] = sequence;  // its clock: 256 for each
+    block[25] = 1;
+    session.ReceiveBlock(block.data(), block.size());
+  };
+  const auto begin = [&](const std::string& resumed) {
+    session.Begin();
+    session.Receive(R"({"type":"welcome","sample_rate":24000,"level":"standard","resume_token":"t")" + resumed + "}");
+  };
+  const auto refuse = [&](const std::string& code, const std::string& more) {
+    session.Receive(R"({"type":"error","code":")" + code + R"(","message":"no")" + more + "}");
+  };
+  session.AddListener("guest", {}, "kemar");
+  std::cout << session.FirstMessage() << '\n';
+  begin("");
+  tell();
+  session.Receive(R"({"type":"listener_added","id":"guest","index":7,"sample_clock":0})");
+  session.Step(0.02);
+  tell();
+  hear(0, 3);
+  hear(7, 7);
+  hear(9, 11);  // of nobody
+  tell();
+  session.Receive(R"({"type":"level_changed","level":"fine","listener":"guest"})");
+  std::cout << session.level() << ' ' << session.AddListener("guest", {})->level() << '\n';
+  session.AddListener("unheard", {});
+  session.AddListener("late", {});
+  tell();
+  session.Lost("a cut");
+  std::cout << session.FirstMessage() << '\n';
+  begin(R"(,"resumed":{"handled":2,"sample_clock":5000,"pose_id":0,"listeners":[{"id":"guest","index":7},{"id":"unheard","index":8}]})");
+  tell();
+  session.Lost("another");
+  begin("");
+  tell();
+  refuse("server_busy", R"(,"listener":"guest","retry_after_s":0.5)");
+  refuse("unknown_hrtf", R"(,"listener":"late")");
+  refuse("unknown_listener", R"(,"listener":"unheard")");
+  tell();
+  session.Step(0.6);
+  tell();
+  refuse("unknown_message", "");
+  tell();
+}
+
 }  // namespace
 
 int main() {
@@ -238,6 +311,8 @@ int main() {
       Resume(in);
     } else if (command == "doors") {
       Doors();
+    } else if (command == "guests") {
+      Guests();
     }
     std::cout.flush();
   }

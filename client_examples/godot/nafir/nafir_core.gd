@@ -1,10 +1,12 @@
-# A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and frames to play. It keeps what is wanted (poses,
-# emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
+# A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and ears to play. It keeps what is wanted (poses,
+# listeners, emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
 #
 # Godot 3 and Godot 4 both read this file: it names nothing that only one of them has, and declares no types.
 #
 # Nafir: metres; x east, y north, z up. The identity looks along +x. Godot: metres; x right, y up, z back. The identity looks along -z.
 # Poses go to the server as {"position": [x, y, z], "orientation": [x, y, z, w]}.
+
+const Ears = preload("nafir_ears.gd")
 
 const PROTOCOL = 3
 const HALF_ROOT = 0.70710678118654752 # sine and cosine of half a quarter turn
@@ -19,36 +21,34 @@ const MOST_ORDERS = 1024
 # Errors after which the server ends the connection, which not every version of Godot tells.
 const LAST_WORDS = ["server_draining", "taken_over", "key_expired", "key_revoked", "stalled", "reads_too_slowly"]
 const LATE = 2 # a flag of blocks
-const FADE_S = 0.005
-const MIX_S = 0.012 # what a mixer takes at once
-const MOST_S = 0.25 # what is more than this above the target is skipped
-const CORRECTION_S = 10.0
-const MOST_CORRECTION = 0.002 # three cents
-const SMOOTHING_S = 1.0
 
 # The stream is live, was lost ("waiting", with the reason in `problem`) or is over ("refused", "lost").
 signal state_changed(state)
 # The clip of an emitter is over, with its reverberation, or cannot be played on after a loss.
 signal emitter_ended(id)
 signal emitter_refused(id, problem)
+# The server has a listener beside the first: also in a connection with which the stream began anew.
+signal listener_added(id)
+# The server does not take a listener beside the first, which is forgotten.
+signal listener_refused(id, problem)
 
 var scene = "apartment"
 var wanted_rate = 0 # 44100, 48000 or 96000; 0 takes the scene's own
 var block_size = 256
 var buffer_blocks = 8
 var target_s = 0.08 # held back against a network that stalls, and a game that draws slowly
-
+var listeners = 1 # there are going to be so many, the first one included: the server keeps room for them
 var give_up_after_s = 300.0 # for so long a server that is gone is tried again
 
 var state = "closed" # connecting, live, waiting, refused, lost
 var problem = "" # why the stream was refused or last lost
 var sample_rate = 0 # of the stream; 0 before the welcome
 var sample_clock = 0 # of the frame after the newest block; goes on over lost connections
-var level = ""
+var level = "" # that the first listener hears
 var heard_pose_id = 0
 var heard_reverberation_pose_id = 0
-var underruns = 0
-# Counts run over all connections. A block is skipped by the server, or lost with a connection.
+var ears = Ears.new() # of the first listener
+# Counts run over all connections and listeners. A block is skipped by the server, or lost with a connection.
 var statistics = {
 	"blocks": 0, "blocks_late": 0, "blocks_skipped": 0, "reconnections": 0, "resumptions": 0, "round_trip_s": 0.0,
 }
@@ -57,6 +57,7 @@ var packets = [] # StreamPeerBuffers to send
 
 var _listener = {"position": [0.0, 0.0, 0.0], "orientation": [0.0, 0.0, 0.0, 1.0]}
 var _listener_moved = false
+var _others = {} # by id, the listeners beside the first
 var _emitters = {} # by id
 var _wanted_level = ""
 var _doors = {} # by name, how far those are open that were moved
@@ -77,19 +78,10 @@ var _since_block_s = 0.0
 var _last_error = null # of the whole stream, in this connection
 var _token = "" # with which, or
 var _snapshot = "" # with which, the stream is resumed
-var _last_block = null # {sequence, sample_clock} of the newest in this stream of the server's
-var _next_clock = -1 # of the server
-var _clock_offset = 0 # what is added to it
+var _last_block = null # the greatest {sequence, sample_clock} of all listeners' blocks in this stream of the server's
+var _clock_offset = 0 # what is added to the server's clock
 var _orders = [] # the newest messages that the server counts, and how many there were
 var _ordered = 0
-var _blocks = [] # of frames, in order
-var _first = 0 # frame of the first block that is played next
-var _waiting_frames = 0
-var _tail = [] # frames of a fade that are still to be played
-var _gain = 0.0 # of a fade in
-var _room = 0 # frames that an empty generator takes
-var _playing = false
-var _smooth = 0.0
 
 
 # ---- poses
@@ -130,6 +122,34 @@ func set_listener(pose):
 	if not _same(_listener, pose):
 		_listener = pose
 		_listener_moved = true
+
+
+# Adds a listener beside the first, who hears the same emitters: a player at a split screen, or a spectator. Returns the ears to play.
+# `head` is one of the server's; empty for its default. One with this id is moved.
+func add_listener(id, pose, head = ""):
+	if not _others.has(id):
+		_others[id] = {
+			"pose": pose, "head": head, "ears": Ears.new(), "moved": true, "has_been": false,
+			"order": 0, # the number of the order that adds it
+			"number": -1, # in the headers of its blocks; -1 until the server has it
+			"is_refused": false, "ask_again_s": 0.0,
+		}
+		_ask(id)
+	move_listener(id, pose)
+	return _others[id].ears
+
+
+# Moves a listener beside the first.
+func move_listener(id, pose):
+	if _others.has(id) and not _same(_others[id].pose, pose):
+		_others[id].pose = pose
+		_others[id].moved = true
+
+
+func remove_listener(id):
+	if _others.has(id):
+		_others.erase(id)
+		_order({"type": "remove_listener", "id": id})
 
 
 # Adds an emitter, or moves the one with this id. Without a clip (null) it plays what push_dry gives it. `options` are further fields of
@@ -288,6 +308,8 @@ func hello():
 		message["sample_rate"] = wanted_rate
 	if _wanted_level != "":
 		message["level"] = _wanted_level
+	if max(listeners, 1 + _others.size()) > 1:
+		message["listeners"] = int(max(listeners, 1 + _others.size()))
 	return message
 
 
@@ -375,6 +397,12 @@ func step(delta_s):
 			emitter.ask_again_s -= delta_s
 			if emitter.ask_again_s <= 0.0:
 				_add(id)
+	for id in _others:
+		var other = _others[id]
+		if other.is_refused:
+			other.ask_again_s -= delta_s
+			if other.ask_again_s <= 0.0:
+				_ask(id)
 	_since_poses_s += delta_s
 	if _since_poses_s >= POSE_INTERVAL_S:
 		_since_poses_s = 0.0
@@ -396,10 +424,16 @@ func receive(message):
 			_snapshot = message["snapshot"]
 			_handled(int(message["handled"]))
 		"level_changed":
-			level = message["level"]
+			if message.get("listener") == null:
+				level = message["level"]
+			elif _others.has(message["listener"]):
+				_others[message["listener"]].ears.level = message["level"]
 		"pong":
 			if int(message["id"]) == _ping_id:
 				statistics.round_trip_s = _since_ping_s + _frame_s
+		"listener_added":
+			if _enter(message["id"], int(message["index"])):
+				emit_signal("listener_added", message["id"])
 		"emitter_added":
 			if _emitters.has(message["id"]):
 				_open(_emitters[message["id"]], int(message["sample_clock"]))
@@ -411,8 +445,13 @@ func receive(message):
 
 func _refused(error):
 	problem = "%s: %s" % [error["code"], error["message"]]
+	if error.get("listener") != null:
+		_refused_listener(error["listener"], error)
+		return
 	var id = error.get("emitter")
 	if id == null:
+		if error["code"] == "unknown_message":
+			_refused_unnamed(error)
 		_last_error = error
 		return
 	if not _emitters.has(id):
@@ -427,8 +466,47 @@ func _refused(error):
 		emit_signal("emitter_ended", id)
 
 
+# One who comes back with a new connection is asked for again when the server says; any other is forgotten. Returns whether it was.
+func _refused_listener(id, error):
+	if not _others.has(id) or _others[id].number >= 0 or error["code"] == "unknown_listener":
+		return false
+	var other = _others[id]
+	if other.has_been and error.get("retry_after_s") != null:
+		other.is_refused = true
+		other.ask_again_s = float(error["retry_after_s"])
+		return false
+	_others.erase(id)
+	emit_signal("listener_refused", id, problem)
+	return true
+
+
+# A server that is too old to know what was asked does not say about whom it speaks. Had it not known another message, it would have the
+# listener, who is removed for that.
+func _refused_unnamed(error):
+	for id in _others.keys():
+		if _others[id].number < 0 and not _others[id].is_refused:
+			if _refused_listener(id, error):
+				_order({"type": "remove_listener", "id": id})
+			return
+
+
+# The server has a listener beside the first, under this number. Returns whether that is news.
+func _enter(id, number):
+	if not _others.has(id):
+		return false # removed meanwhile
+	var other = _others[id]
+	var is_new = other.number < 0
+	other.number = number
+	other.has_been = true
+	other.moved = true
+	other.ears.level = level
+	other.ears.open(sample_rate, target_s)
+	return is_new
+
+
 func _welcome(message):
 	sample_rate = int(message["sample_rate"])
+	ears.open(sample_rate, target_s)
 	level = message["level"]
 	_token = message.get("resume_token", "")
 	_listener_moved = true
@@ -442,11 +520,15 @@ func _welcome(message):
 	if statistics.blocks > 0:
 		statistics.reconnections += 1
 	state = "live" # so that what follows is said; the game is told once it has been
+	var entered = []
 	if resumed != null:
 		_go_on(int(resumed["handled"]), int(resumed["sample_clock"]), int(resumed["pose_id"]))
+		entered = _go_on_hearing(int(resumed["handled"]), resumed.get("listeners"))
 	else:
 		_begin_anew()
 	emit_signal("state_changed", "live")
+	for id in entered:
+		emit_signal("listener_added", id)
 
 
 # The server has the stream still: it gets what it has not handled, and where everything is now.
@@ -467,12 +549,33 @@ func _go_on(handled, clock, pose_id):
 			_open(emitter, clock)
 
 
+# Listeners that the server has go on. Those that it should have and has not are asked for again. Returns the ids of those that are news.
+func _go_on_hearing(handled, there):
+	var numbers = {}
+	for each in (there if there != null else []):
+		numbers[each["id"]] = int(each["index"])
+	var entered = []
+	for id in _others:
+		var other = _others[id]
+		if other.order > handled:
+			continue # it is among what is sent again
+		if numbers.has(id):
+			# That it is there may have been said just before the connection was lost.
+			if _enter(id, numbers[id]):
+				entered.append(id)
+		elif other.number >= 0:
+			other.number = -1 # an error says why it is gone
+		elif not other.is_refused:
+			_ask(id) # the answer was lost
+	return entered
+
+
 # The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
 func _begin_anew():
-	if _next_clock >= 0:
+	if ears.next_clock >= 0:
 		var away_s = max(0.0, _since_block_s - float(buffer_blocks * block_size) / sample_rate)
 		_clock_offset = sample_clock + int(away_s * sample_rate)
-	_next_clock = -1
+	ears.next_clock = -1
 	_last_block = null
 	_snapshot = ""
 	_orders.clear()
@@ -481,6 +584,10 @@ func _begin_anew():
 	for door in _doors: # not in the hello: a door that the scene lacks would end the stream
 		_order_door(door)
 	_doors_moved.clear()
+	for id in _others: # before what they are to hear from its beginning
+		_others[id].number = -1
+		_others[id].ears.next_clock = -1
+		_ask(id)
 	for id in _emitters.keys():
 		var emitter = _emitters[id]
 		if emitter.start >= 0 and _plays_once(emitter):
@@ -510,36 +617,53 @@ func receive_block(data):
 	var block = parse_block(data)
 	if block == null or block.channels != 2:
 		return false
-	heard_pose_id = block.pose_id
-	heard_reverberation_pose_id = block.reverberation_pose_id
+	var id = null
+	if block.listener > 0:
+		id = _id_of(block.listener)
+		if id == null:
+			return true # of one that was removed meanwhile
 	statistics.blocks += 1
 	if block.flags & LATE:
 		statistics.blocks_late += 1
-	if block.sample_clock != _next_clock:
-		if _next_clock >= 0:
-			statistics.blocks_skipped += int((block.sample_clock - _next_clock) / block.frames.size())
-		_end_sound()
-	_last_block = {"sequence": block.sequence, "sample_clock": block.sample_clock}
-	_next_clock = block.sample_clock + block.frames.size()
-	sample_clock = _next_clock + _clock_offset
+	if _last_block == null:
+		_last_block = {"sequence": 0, "sample_clock": 0}
+	_last_block.sequence = int(max(_last_block.sequence, block.sequence))
+	_last_block.sample_clock = int(max(_last_block.sample_clock, block.sample_clock))
 	_since_block_s = 0.0
-	_blocks.append(block.frames)
-	_waiting_frames += block.frames.size()
+	var whose = ears if id == null else _others[id].ears
+	statistics.blocks_skipped += whose.take(block)
 	if block.sequence % ACKNOWLEDGE_EVERY == ACKNOWLEDGE_EVERY - 1:
-		_say({"type": "acknowledge", "sequence": block.sequence})
-	for id in _emitters:
-		_send_dry(id, block)
+		var message = {"type": "acknowledge", "sequence": block.sequence}
+		if id != null:
+			message["listener"] = id
+		_say(message)
+	if id != null:
+		return true
+	heard_pose_id = block.pose_id
+	heard_reverberation_pose_id = block.reverberation_pose_id
+	sample_clock = ears.next_clock + _clock_offset
+	for emitter_id in _emitters:
+		_send_dry(emitter_id, block)
 	return true
 
 
-# A binary message as {flags, channels, sequence, sample_clock, pose_id, reverberation_pose_id, frames}, or null. `frames` are Vector2 of
+func _id_of(number):
+	for id in _others:
+		if _others[id].number == number:
+			return id
+	return null
+
+
+# A binary message as {flags, channels, listener, sequence, sample_clock, pose_id, reverberation_pose_id, frames}, or null. `frames` are Vector2 of
 # both ears, or arrays of samples where there are not two channels.
 static func parse_block(data):
 	var size = data.get_size()
 	data.seek(0)
 	if size < 28 or data.get_u8() != 1:
 		return null
-	var block = {"flags": data.get_u8(), "channels": data.get_u16(), "sequence": data.get_u32(), "sample_clock": data.get_u64()}
+	var block = {"flags": data.get_u8(), "channels": data.get_u8(), "listener": data.get_u8()}
+	block["sequence"] = data.get_u32()
+	block["sample_clock"] = data.get_u64()
 	block["pose_id"] = data.get_u32()
 	block["reverberation_pose_id"] = data.get_u32()
 	var count = data.get_u32()
@@ -559,9 +683,10 @@ static func parse_block(data):
 	return block
 
 
-static func serialize_listener(pose_id, pose):
+# `number` is that of a listener beside the first.
+static func serialize_listener(pose_id, pose, number = 0):
 	var data = StreamPeerBuffer.new()
-	for each in [2, 0, 0, 0]:
+	for each in [2, number, 0, 0]:
 		data.put_u8(each)
 	data.put_u32(pose_id)
 	for each in pose.position + pose.orientation:
@@ -606,6 +731,16 @@ func _add(id):
 		message["clip"] = emitter.clip
 	_order(message)
 	emitter.number = _ordered
+
+
+func _ask(id):
+	var other = _others[id]
+	other.is_refused = false
+	var message = {"type": "add_listener", "id": id, "position": other.pose.position, "orientation": other.pose.orientation}
+	if other.head != "":
+		message["hrtf"] = other.head
+	_order(message)
+	other.order = _ordered
 
 
 func _server_clock(clock):
@@ -673,101 +808,13 @@ func _say_poses():
 				"type": "move_emitter", "id": id, "pose_id": _pose_id,
 				"position": emitter.pose.position, "orientation": emitter.pose.orientation,
 			})
+	for id in _others:
+		var other = _others[id]
+		if other.moved and other.number >= 0:
+			other.moved = false
+			_pose_id += 1
+			packets.append(serialize_listener(_pose_id, other.pose, other.number))
 	if _listener_moved:
 		_listener_moved = false
 		_pose_id += 1
 		packets.append(serialize_listener(_pose_id, _listener))
-
-
-# ---- playing
-
-# Gives an AudioStreamGeneratorPlayback what it takes. Returns the pitch_scale of its player, which makes up for the difference between
-# the server's clock and the sound card's. The last frames are kept until others follow, since they fade out if none do.
-func play(generator, delta_s):
-	if sample_rate == 0:
-		return 1.0
-	var free = generator.get_frames_available()
-	_room = max(_room, free)
-	while free > 0 and _tail.size() > 0:
-		generator.push_frame(_tail.pop_front())
-		free -= 1
-	var target = target_s * sample_rate
-	var fade = int(FADE_S * sample_rate)
-	var queued = _room - free
-	var fill = _waiting_frames + queued
-	if not _playing:
-		if fill < target or _tail.size() > 0:
-			return 1.0
-		_playing = true
-		_smooth = target
-		_gain = 0.0
-		_skip(fill - target)
-	elif _waiting_frames <= fade and queued < (delta_s + MIX_S) * sample_rate:
-		underruns += 1
-		_end_sound()
-		return play(generator, delta_s)
-	elif queued <= 0 and fill > target: # the game drew too slowly, and nothing was heard meanwhile
-		underruns += 1
-		_gain = 0.0
-		_skip(fill - target)
-	elif fill > target + MOST_S * sample_rate:
-		_fade_out()
-		_skip(fill - target)
-		return play(generator, delta_s)
-	while free > 0 and _waiting_frames > fade:
-		if _gain < 1.0:
-			generator.push_frame(_take_frame())
-			free -= 1
-			continue
-		var block = _blocks[0]
-		var count = int(min(min(free, _waiting_frames - fade), block.size() - _first))
-		for index in range(_first, _first + count):
-			generator.push_frame(block[index])
-		free -= count
-		_skip(count)
-	_smooth += min(1.0, delta_s / SMOOTHING_S) * (fill - _smooth)
-	var correction = (_smooth - target) / (CORRECTION_S * sample_rate)
-	return 1.0 + max(-MOST_CORRECTION, min(MOST_CORRECTION, correction))
-
-
-# What waits to be played does not go on: it fades out, and what comes next fades in, once enough of it waits.
-func _end_sound():
-	if _playing:
-		_fade_out()
-	_playing = false
-	_blocks.clear()
-	_first = 0
-	_waiting_frames = 0
-
-
-func _fade_out():
-	var fade = int(min(FADE_S * sample_rate, _waiting_frames))
-	for index in range(fade):
-		_tail.append(_take_frame() * (1.0 - (index + 1.0) / fade))
-	_gain = 0.0
-
-
-func _take_frame():
-	var block = _blocks[0]
-	var frame = block[_first]
-	_first += 1
-	_waiting_frames -= 1
-	if _first == block.size():
-		_blocks.pop_front()
-		_first = 0
-	if _gain < 1.0:
-		_gain = min(1.0, _gain + 1.0 / (FADE_S * sample_rate))
-		return frame * _gain
-	return frame
-
-
-func _skip(frames):
-	frames = int(max(0, min(frames, _waiting_frames)))
-	while frames > 0:
-		var some = min(frames, _blocks[0].size() - _first)
-		_first += some
-		_waiting_frames -= some
-		frames -= some
-		if _first == _blocks[0].size():
-			_blocks.pop_front()
-			_first = 0

@@ -5,6 +5,8 @@ extends Spatial
 signal state_changed(state)
 # The clip of an emitter is over, with its reverberation.
 signal emitter_ended(id)
+# The server does not take a listener beside the first, which is forgotten.
+signal listener_refused(id, problem)
 
 const Core = preload("nafir_core.gd")
 
@@ -14,6 +16,7 @@ export var key = "" # an API key or token, if the server asks for one
 export var buffer_s = 0.08
 export var sample_rate = 48000 # or 44100 or 96000; 0 takes the scene's own
 export var give_up_after_s = 300.0 # for so long a server that is gone is tried again
+export var listeners = 1 # there are going to be so many, with this one: the server keeps room for them
 export(NodePath) var origin # the node at the scene's origin; empty if that is the world's
 
 var core = Core.new()
@@ -22,6 +25,7 @@ var _has_ended = false
 var _why = "" # the connection has ended
 var _code = 0
 var _nodes = {} # id -> {node, clip, gain_db, options}
+var _others = {} # id -> {node, head, player, ears} of listeners beside this one
 var _player = AudioStreamPlayer.new()
 
 
@@ -30,12 +34,30 @@ func _ready():
 	core.wanted_rate = sample_rate
 	core.target_s = buffer_s
 	core.give_up_after_s = give_up_after_s
+	core.listeners = listeners
 	core.connect("state_changed", self, "_on_core_state_changed")
 	core.connect("emitter_ended", self, "_on_core_emitter_ended")
 	core.connect("emitter_refused", self, "_on_core_emitter_refused")
+	core.connect("listener_refused", self, "_on_core_listener_refused")
 	randomize()
 	add_child(_player)
 	_open()
+
+
+# Somebody hears the same emitters at the node, wherever that moves: a player at a split screen, or a spectator. Returns the player of what
+# is heard there, whose bus or volume you may change. `head` is one of the server's; empty for its default.
+func add_listener(id, node, head = ""):
+	remove_listener(id)
+	_others[id] = {"node": node, "head": head, "player": AudioStreamPlayer.new(), "ears": null}
+	add_child(_others[id].player)
+	return _others[id].player
+
+
+func remove_listener(id):
+	if _others.has(id):
+		_others[id].player.queue_free()
+		_others.erase(id)
+		core.remove_listener(id)
 
 
 # The emitter plays a clip of the server at the node, wherever that moves; with null, what core.push_dry gives it. `options` are those of
@@ -128,6 +150,12 @@ func _on_core_emitter_refused(id, problem):
 	push_warning("Nafir: emitter %s: %s" % [id, problem])
 
 
+func _on_core_listener_refused(id, problem):
+	remove_listener(id)
+	push_warning("Nafir: listener %s: %s" % [id, problem])
+	emit_signal("listener_refused", id, problem)
+
+
 func _received():
 	var peer = _socket.get_peer(1)
 	var packet = peer.get_packet()
@@ -145,6 +173,11 @@ func _process(delta):
 		if _has_ended:
 			_lost(_why, _code)
 	core.set_listener(pose_of(self))
+	for id in _others.keys():
+		if is_instance_valid(_others[id].node):
+			_others[id].ears = core.add_listener(id, pose_of(_others[id].node), _others[id].head)
+		else:
+			remove_listener(id)
 	for id in _nodes.keys():
 		if is_instance_valid(_nodes[id].node):
 			core.set_emitter(id, _nodes[id].clip, pose_of(_nodes[id].node), _nodes[id].gain_db, _nodes[id].options)
@@ -163,7 +196,9 @@ func _process(delta):
 		var peer = _socket.get_peer(1)
 		peer.set_write_mode(WebSocketPeer.WRITE_MODE_BINARY)
 		peer.put_packet(core.packets.pop_front().data_array)
-	_play(delta)
+	_play(_player, core.ears, delta)
+	for id in _others:
+		_play(_others[id].player, _others[id].ears, delta)
 
 
 func _send_text(message):
@@ -172,15 +207,15 @@ func _send_text(message):
 	peer.put_packet(to_json(message).to_utf8())
 
 
-func _play(delta):
-	if core.sample_rate == 0:
+func _play(player, ears, delta):
+	if ears.sample_rate == 0:
 		return
-	if _player.stream == null or _player.stream.mix_rate != core.sample_rate:
-		_player.stream = AudioStreamGenerator.new()
-		_player.stream.mix_rate = core.sample_rate
-		_player.stream.buffer_length = buffer_s
-		_player.play()
-	_player.pitch_scale = core.play(_player.get_stream_playback(), delta)
+	if player.stream == null or player.stream.mix_rate != ears.sample_rate:
+		player.stream = AudioStreamGenerator.new()
+		player.stream.mix_rate = ears.sample_rate
+		player.stream.buffer_length = buffer_s
+		player.play()
+	player.pitch_scale = ears.play(player.get_stream_playback(), delta)
 
 
 func _exit_tree():

@@ -5,6 +5,8 @@ extends Node3D
 signal state_changed(state: String)
 ## The clip of an emitter is over, with its reverberation.
 signal emitter_ended(id: String)
+## The server does not take a listener beside the first, which is forgotten.
+signal listener_refused(id: String, problem: String)
 
 const Core = preload("nafir_core.gd")
 
@@ -14,12 +16,14 @@ const Core = preload("nafir_core.gd")
 @export var buffer_s := 0.08
 @export var sample_rate := 48000 ## or 44100 or 96000; 0 takes the scene's own
 @export var give_up_after_s := 300.0 ## for so long a server that is gone is tried again
+@export var listeners := 1 ## there are going to be so many, with this one: the server keeps room for them
 @export var origin: Node3D ## the node at the scene's origin; empty if that is the world's
 
 var core = Core.new()
 var _socket: WebSocketPeer
 var _greeted := false
 var _nodes := {} # id -> {node, clip, gain_db, options}
+var _others := {} # id -> {node, head, player, ears} of listeners beside this one
 var _player := AudioStreamPlayer.new()
 var _microphone: AudioEffectCapture # null without one
 var _microphone_id := ""
@@ -30,11 +34,30 @@ func _ready() -> void:
 	core.wanted_rate = sample_rate
 	core.target_s = buffer_s
 	core.give_up_after_s = give_up_after_s
+	core.listeners = listeners
 	core.state_changed.connect(func(state: String) -> void: state_changed.emit(state))
 	core.emitter_ended.connect(_on_core_emitter_ended)
 	core.emitter_refused.connect(_on_core_emitter_refused)
+	core.listener_refused.connect(_on_core_listener_refused)
 	add_child(_player)
 	_open()
+
+
+## Somebody hears the same emitters at the node, wherever that moves: a player at a split screen, or a spectator. Returns the player of what
+## is heard there, whose bus or volume you may change. [param head] is one of the server's; empty for its default.
+func add_listener(id: String, node: Node3D, head := "") -> AudioStreamPlayer:
+	remove_listener(id)
+	var player := AudioStreamPlayer.new()
+	_others[id] = {"node": node, "head": head, "player": player, "ears": null}
+	add_child(player)
+	return player
+
+
+func remove_listener(id: String) -> void:
+	if _others.has(id):
+		_others[id].player.queue_free()
+		_others.erase(id)
+		core.remove_listener(id)
 
 
 ## The emitter plays a clip of the server at the node, wherever that moves; with null, what core.push_dry gives it. [param options] are those
@@ -122,6 +145,12 @@ func _on_core_emitter_refused(id: String, problem: String) -> void:
 	push_warning("Nafir: emitter %s: %s" % [id, problem])
 
 
+func _on_core_listener_refused(id: String, problem: String) -> void:
+	remove_listener(id)
+	push_warning("Nafir: listener %s: %s" % [id, problem])
+	listener_refused.emit(id, problem)
+
+
 func _poll() -> void:
 	_socket.poll()
 	var state := _socket.get_ready_state()
@@ -148,6 +177,11 @@ func _process(delta: float) -> void:
 	if _microphone != null:
 		var frames := _microphone.get_buffer(_microphone.get_frames_available())
 		core.push_dry_frames(_microphone_id, frames, AudioServer.get_mix_rate())
+	for id in _others.keys():
+		if is_instance_valid(_others[id].node):
+			_others[id].ears = core.add_listener(id, pose_of(_others[id].node), _others[id].head)
+		else:
+			remove_listener(id)
 	for id in _nodes.keys():
 		if is_instance_valid(_nodes[id].node):
 			core.set_emitter(id, _nodes[id].clip, pose_of(_nodes[id].node), _nodes[id].gain_db, _nodes[id].options)
@@ -164,19 +198,21 @@ func _process(delta: float) -> void:
 		_socket.send_text(JSON.stringify(core.texts.pop_front()))
 	while _socket != null and core.packets.size() > 0:
 		_socket.send(core.packets.pop_front().data_array)
-	_play(delta)
+	_play(_player, core.ears, delta)
+	for id in _others:
+		_play(_others[id].player, _others[id].ears, delta)
 
 
-func _play(delta: float) -> void:
-	if core.sample_rate == 0:
+func _play(player: AudioStreamPlayer, ears: RefCounted, delta: float) -> void:
+	if ears.sample_rate == 0:
 		return
-	if _player.stream == null or _player.stream.mix_rate != core.sample_rate:
+	if player.stream == null or player.stream.mix_rate != ears.sample_rate:
 		var generator := AudioStreamGenerator.new()
-		generator.mix_rate = core.sample_rate
+		generator.mix_rate = ears.sample_rate
 		generator.buffer_length = buffer_s
-		_player.stream = generator
-		_player.play()
-	_player.pitch_scale = core.play(_player.get_stream_playback(), delta)
+		player.stream = generator
+		player.play()
+	player.pitch_scale = ears.play(player.get_stream_playback(), delta)
 
 
 func _exit_tree() -> void:

@@ -27,6 +27,9 @@ namespace Nafir
         [Tooltip("Seconds for which a server that is gone is tried again.")]
         public float giveUpAfter = 300;
 
+        [Tooltip("How many listeners there are going to be, with this one: the server keeps room for them.")]
+        public int listeners = 1;
+
         readonly ConcurrentQueue<Action> news = new ConcurrentQueue<Action>(); // of the stream's threads, for the game's
         volatile NafirStream stream;
 
@@ -42,10 +45,11 @@ namespace Nafir
 
         void OnEnable()
         {
-            var opened = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer, key, giveUpAfterS: giveUpAfter);
+            var opened = new NafirStream(url, scene, AudioSettings.outputSampleRate, PoseOf(transform), buffer, key, giveUpAfterS: giveUpAfter, listeners: listeners);
             opened.StateChanged += state => news.Enqueue(() => Tell(state, opened.Problem));
             opened.EmitterEnded += id => news.Enqueue(() => EmitterEnded?.Invoke(id));
             opened.EmitterRefused += (id, problem) => news.Enqueue(() => Debug.LogWarning($"Nafir: emitter {id}: {problem}", this));
+            opened.ListenerRefused += (id, problem) => news.Enqueue(() => Debug.LogWarning($"Nafir: listener {id}: {problem}", this));
             stream = opened;
         }
 

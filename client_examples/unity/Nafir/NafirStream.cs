@@ -1,5 +1,5 @@
 // A live stream that reconnects by itself, on threads of its own. A server that has kept the stream goes on with it, and is sent what it had
-// not got yet. Else the stream begins anew with what is wanted (poses, emitters, level). Without a type of Unity's.
+// not got yet. Else the stream begins anew with what is wanted (poses, listeners, emitters, level). Without a type of Unity's.
 
 using System;
 using System.Collections.Concurrent;
@@ -29,18 +29,20 @@ namespace Nafir
 
         readonly Uri url;
         readonly string scene, key;
-        readonly int blockSize, bufferBlocks, outputRate;
+        readonly int blockSize, bufferBlocks, outputRate, listeners;
         readonly double targetS, giveUpAfterS;
         readonly CancellationTokenSource ending = new CancellationTokenSource();
         readonly Task running;
         readonly object gate = new object();
         readonly Dictionary<string, float> doors = new Dictionary<string, float>(); // those that the game has moved
         readonly HashSet<string> doorsMoved = new HashSet<string>(); // of them, while there was no connection
+        readonly Dictionary<string, Other> others = new Dictionary<string, Other>(); // listeners beside the first
         readonly Dictionary<string, Emitter> emitters = new Dictionary<string, Emitter>();
         readonly ConcurrentQueue<object> outgoing = new ConcurrentQueue<object>(); // string or byte[]
         readonly NafirOrders orders = new NafirOrders();
         readonly NafirBlock block = new NafirBlock();
-        readonly float[] stereo = new float[2 * 1024];
+        readonly NafirBlock newest = new NafirBlock(); // the greatest sequence and clock of all listeners' blocks
+        readonly NafirEars ears = new NafirEars(); // of the first listener
         readonly Stopwatch sinceLost = Stopwatch.StartNew(), sinceBlock = Stopwatch.StartNew(), sincePing = Stopwatch.StartNew();
         NafirStatistics counts;
         NafirPose listener;
@@ -50,9 +52,7 @@ namespace Nafir
         string token, snapshot; // with which the stream is resumed
         uint poseId, pingId;
         int shots;
-        bool hasBlock; // since the stream began; it is in `block`
-        ulong nextClock, clockOffset; // of the server's; what is added to it
-        NafirPlayback playback;
+        ulong clockOffset; // what is added to the server's clock
         volatile int state = (int)NafirState.Connecting;
 
         sealed class Emitter
@@ -72,9 +72,22 @@ namespace Nafir
             public bool PlaysOnce => Source.Clip != null && (!Source.Loop || Stopped);
         }
 
+        sealed class Other
+        {
+            public readonly NafirEars Ears = new NafirEars();
+            public NafirPose Pose;
+            public string Head;
+            public bool Moved, HasBeen;
+            public long Order; // the number of the order that adds it
+            public int Number = -1; // in the headers of its blocks; -1 until the server has it
+            public Stopwatch Refused; // since when
+            public long AskAgainMs; // after that
+        }
+
         /// <summary>`outputRate` is the sound card's. `targetS` is how much sound is held back against a network that stalls. `key` is an API
-        /// key or token, if the server asks for one. A server that is gone is tried again for `giveUpAfterS` seconds.</summary>
-        public NafirStream(string url, string scene, int outputRate, NafirPose listener, double targetS = 0.06, string key = null, int blockSize = 256, int bufferBlocks = 8, double giveUpAfterS = 300)
+        /// key or token, if the server asks for one. A server that is gone is tried again for `giveUpAfterS` seconds. It keeps room for so
+        /// many `listeners`, the first one included.</summary>
+        public NafirStream(string url, string scene, int outputRate, NafirPose listener, double targetS = 0.06, string key = null, int blockSize = 256, int bufferBlocks = 8, double giveUpAfterS = 300, int listeners = 1)
         {
             this.url = new Uri(url);
             this.scene = scene;
@@ -85,6 +98,7 @@ namespace Nafir
             this.blockSize = blockSize;
             this.bufferBlocks = bufferBlocks;
             this.giveUpAfterS = giveUpAfterS;
+            this.listeners = listeners;
             running = Task.Run(Run);
         }
 
@@ -96,13 +110,14 @@ namespace Nafir
         /// <summary>The stream's sample rate; 0 before the first welcome.</summary>
         public int SampleRate { get; private set; }
 
-        /// <summary>The quality level that is heard; null before the first welcome.</summary>
+        /// <summary>The quality level that the first listener hears; null before the first welcome.</summary>
         public string Level { get; private set; }
 
         /// <summary>The clock of the sample after the newest block, which goes on over lost connections.</summary>
         public ulong SampleClock { get; private set; }
 
-        public int Underruns => Volatile.Read(ref playback)?.Underruns ?? 0;
+        /// <summary>How often the audio thread of the first listener found too little to play.</summary>
+        public int Underruns => ears.Underruns;
 
         /// <summary>The newest poses that are in the sound received last: in its direct sound, and in all of it.</summary>
         public uint HeardPoseId { get; private set; }
@@ -117,7 +132,7 @@ namespace Nafir
                 {
                     var found = counts;
                     found.Underruns = Underruns;
-                    found.WaitingS = playback?.WaitingS ?? 0;
+                    found.WaitingS = ears.WaitingS;
                     return found;
                 }
             }
@@ -135,12 +150,54 @@ namespace Nafir
         /// <summary>An emitter could not be added, and why.</summary>
         public event Action<string, string> EmitterRefused;
 
+        /// <summary>The server has a listener beside the first: also after a connection at whose end the stream began anew.</summary>
+        public event Action<string> ListenerAdded;
+
+        /// <summary>The server does not take a listener beside the first, and why. It is forgotten.</summary>
+        public event Action<string, string> ListenerRefused;
+
         public void SetListener(NafirPose pose)
         {
             lock (gate)
             {
                 listener = pose;
                 listenerMoved = true;
+            }
+        }
+
+        /// <summary>Adds a listener beside the first, who hears the same emitters: a player at a split screen, or a spectator. Gives the ears
+        /// from which an audio thread takes what is heard. `head` is one of the server's; null for its default. One with this id is moved.</summary>
+        public NafirEars AddListener(string id, NafirPose pose, string head = null)
+        {
+            lock (gate)
+            {
+                if (!others.TryGetValue(id, out var other))
+                {
+                    others[id] = other = new Other { Pose = pose, Head = head };
+                    Ask(id, other);
+                }
+                other.Pose = pose;
+                other.Moved = true;
+                return other.Ears;
+            }
+        }
+
+        /// <summary>Moves a listener beside the first.</summary>
+        public void MoveListener(string id, NafirPose pose)
+        {
+            lock (gate)
+            {
+                if (!others.TryGetValue(id, out var other)) return;
+                other.Pose = pose;
+                other.Moved = true;
+            }
+        }
+
+        public void RemoveListener(string id)
+        {
+            lock (gate)
+            {
+                if (others.Remove(id)) Order(NafirWire.RemoveListener(id));
             }
         }
 
@@ -247,32 +304,9 @@ namespace Nafir
             return dry != null && dry.Push(samples, frames);
         }
 
-        /// <summary>Adds what is heard to interleaved samples at the output's rate, on the audio thread. Both ears go to the first two
-        /// channels; a single one has their mean.</summary>
-        public void AddTo(float[] data, int channels)
-        {
-            var from = Volatile.Read(ref playback);
-            if (from == null) return;
-            int frames = data.Length / channels;
-            for (int done = 0; done < frames;)
-            {
-                int some = Math.Min(frames - done, stereo.Length / 2);
-                from.Read(stereo, some);
-                for (int i = 0; i < some; i++)
-                {
-                    int to = (done + i) * channels;
-                    float left = stereo[2 * i], right = stereo[2 * i + 1];
-                    if (channels == 1)
-                    {
-                        data[to] += (left + right) / 2;
-                        continue;
-                    }
-                    data[to] += left;
-                    data[to + 1] += right;
-                }
-                done += some;
-            }
-        }
+        /// <summary>Adds what the first listener hears to interleaved samples at the output's rate, on the audio thread. Both ears go to the
+        /// first two channels; a single one has their mean.</summary>
+        public void AddTo(float[] data, int channels) => ears.AddTo(data, channels);
 
         /// <summary>Leaves for good: the server keeps nothing. Waits for the goodbye, a quarter of a second at most.</summary>
         public void Dispose()
@@ -401,7 +435,8 @@ namespace Nafir
                         else
                         {
                             var text = NafirJson.ParseObject(Encoding.UTF8.GetString(message.GetBuffer(), 0, (int)message.Length));
-                            if (text["type"] as string == "error" && !(text.TryGetValue("emitter", out about) && about != null)) lastError = text;
+                            var isOfStream = !(text.TryGetValue("emitter", out about) && about != null || text.TryGetValue("listener", out about) && about != null);
+                            if (text["type"] as string == "error" && isOfStream) lastError = text;
                             if (Read(text)) sending = SendAll(socket, leaving.Token);
                         }
                         message.SetLength(0);
@@ -433,8 +468,8 @@ namespace Nafir
         {
             lock (gate)
             {
-                if (CanResume) return NafirWire.Resume(token, snapshot, hasBlock ? block : null);
-                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel);
+                if (CanResume) return NafirWire.Resume(token, snapshot, ears.HasBlock ? newest : null);
+                return NafirWire.Hello(scene, wantsOutputRate ? outputRate : 0, blockSize, bufferBlocks, listener, wantedLevel, Math.Max(listeners, 1 + others.Count));
             }
         }
 
@@ -456,7 +491,7 @@ namespace Nafir
         bool Read(Dictionary<string, object> message)
         {
             var type = message["type"] as string;
-            string ended = null, refused = null;
+            string ended = null, refused = null, entered = null, left = null;
             if (type == "error" && !welcomed) throw new RefusalException(message);
             if (type == "welcome") Welcome(message);
             lock (gate)
@@ -469,7 +504,10 @@ namespace Nafir
                     snapshot = (string)message["snapshot"];
                     orders.Forget((long)(double)message["handled"]);
                 }
-                else if (type == "level_changed") Level = (string)message["level"];
+                else if (type == "listener_added") entered = Enter(id, (int)(double)message["index"]);
+                else if (type == "error" && message.TryGetValue("listener", out name) && name != null) left = Refuse((string)name, message);
+                else if (type == "error" && (string)message["code"] == "unknown_message") left = RefuseWhoIsAwaited(message);
+                else if (type == "level_changed") LevelChanged(message);
                 else if (type == "pong" && (double)message["id"] == pingId) counts.RoundTripS = sincePing.Elapsed.TotalSeconds;
                 else if (emitter == null) { }
                 else if (type == "emitter_added") Open(emitter, (ulong)(double)message["sample_clock"]);
@@ -494,12 +532,15 @@ namespace Nafir
             Received?.Invoke(message);
             if (ended != null) EmitterEnded?.Invoke(ended);
             if (refused != null) EmitterRefused?.Invoke(refused, Problem);
+            if (entered != null) ListenerAdded?.Invoke(entered);
+            if (left != null) ListenerRefused?.Invoke(left, Problem);
             return type == "welcome";
         }
 
         void Welcome(Dictionary<string, object> message)
         {
             var over = new List<string>();
+            var entered = new List<string>();
             lock (gate)
             {
                 welcomed = true;
@@ -508,19 +549,20 @@ namespace Nafir
                 Level = (string)message["level"];
                 while (outgoing.TryDequeue(out _)) { } // of the last connection
                 listenerMoved = true;
-                if (playback == null || SampleRate != sampleRate) Volatile.Write(ref playback, new NafirPlayback(2, sampleRate, outputRate, targetS));
+                ears.Open(sampleRate, outputRate, targetS);
                 SampleRate = sampleRate;
                 if (everWelcomed) counts.Reconnections++;
                 everWelcomed = true;
-                if (message.TryGetValue("resumed", out var resumed) && resumed != null) GoOn((Dictionary<string, object>)resumed);
+                if (message.TryGetValue("resumed", out var resumed) && resumed != null) GoOn((Dictionary<string, object>)resumed, entered);
                 else Begin(over);
             }
             foreach (var id in over) EmitterEnded?.Invoke(id);
+            foreach (var id in entered) ListenerAdded?.Invoke(id);
             Become(NafirState.Live);
         }
 
         /// <summary>The server has the stream still: it gets what it has not handled, and where everything is now.</summary>
-        void GoOn(Dictionary<string, object> resumed)
+        void GoOn(Dictionary<string, object> resumed, List<string> entered)
         {
             var handled = (long)(double)resumed["handled"];
             var clock = (ulong)(double)resumed["sample_clock"];
@@ -541,23 +583,48 @@ namespace Nafir
                 // What was added is there, and that it is heard may have been said just before the connection was lost.
                 if (emitter.Heard || emitter.Number <= handled) Open(emitter, clock);
             }
+            var numbers = new Dictionary<string, int>();
+            if (resumed.TryGetValue("listeners", out var listed))
+            {
+                foreach (Dictionary<string, object> each in (List<object>)listed) numbers[(string)each["id"]] = (int)(double)each["index"];
+            }
+            foreach (var pair in others)
+            {
+                var other = pair.Value;
+                if (other.Order > handled) continue; // it is among what is sent again
+                if (numbers.TryGetValue(pair.Key, out var number))
+                {
+                    // That it is there may have been said just before the connection was lost.
+                    if (Enter(pair.Key, number) != null) entered.Add(pair.Key);
+                }
+                else if (other.Number >= 0) other.Number = -1; // an error says why it is gone
+                else if (other.Refused == null) Ask(pair.Key, other); // the answer was lost
+            }
         }
 
         /// <summary>The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.</summary>
         void Begin(List<string> over)
         {
-            if (hasBlock)
+            if (ears.HasBlock)
             {
                 var awayS = Math.Max(0, sinceBlock.Elapsed.TotalSeconds - (double)bufferBlocks * blockSize / SampleRate);
                 clockOffset = SampleClock + (ulong)(awayS * SampleRate);
             }
-            hasBlock = false;
+            ears.BeginAnew();
+            newest.Sequence = 0;
+            newest.SampleClock = 0;
             orders.Clear();
             snapshot = null;
             poseId = 0;
             // Not in the hello: a door that the scene lacks would end the stream.
             foreach (var pair in doors) Order(NafirWire.SetDoor(pair.Key, pair.Value));
             doorsMoved.Clear();
+            foreach (var pair in others) // before what they are to hear from its beginning
+            {
+                pair.Value.Number = -1;
+                pair.Value.Ears.BeginAnew();
+                Ask(pair.Key, pair.Value);
+            }
             foreach (var pair in emitters)
             {
                 if (pair.Value.Heard && pair.Value.PlaysOnce) over.Add(pair.Key);
@@ -592,26 +659,79 @@ namespace Nafir
             emitter.Number = orders.Count;
         }
 
+        void Ask(string id, Other other)
+        {
+            other.Refused = null;
+            Order(NafirWire.AddListener(id, other.Pose, other.Head));
+            other.Order = orders.Count;
+        }
+
+        /// <summary>The server has a listener beside the first, under this number. Returns its id if that is news.</summary>
+        string Enter(string id, int number)
+        {
+            if (!others.TryGetValue(id, out var other)) return null; // removed meanwhile
+            var isNew = other.Number < 0;
+            other.Number = number;
+            other.HasBeen = other.Moved = true;
+            other.Ears.Level = Level;
+            other.Ears.Open(SampleRate, outputRate, targetS);
+            return isNew ? id : null;
+        }
+
+        /// <summary>Takes an error about a listener. One who comes back with a new connection is asked for again when the server says; any
+        /// other is forgotten, and its id returned.</summary>
+        string Refuse(string id, Dictionary<string, object> error)
+        {
+            if (!others.TryGetValue(id, out var other) || other.Number >= 0 || (string)error["code"] == "unknown_listener") return null;
+            other.AskAgainMs = AdviceMs(error);
+            if (other.HasBeen && other.AskAgainMs > 0)
+            {
+                other.Refused = Stopwatch.StartNew();
+                return null;
+            }
+            others.Remove(id);
+            return id;
+        }
+
+        /// <summary>As <see cref="Refuse"/>, of a server that is too old to know what was asked, and so does not say about whom it speaks. Had
+        /// it not known another message, it would have the listener, who is removed for that.</summary>
+        string RefuseWhoIsAwaited(Dictionary<string, object> error)
+        {
+            foreach (var pair in others)
+            {
+                if (pair.Value.Number >= 0 || pair.Value.Refused != null) continue;
+                var id = Refuse(pair.Key, error);
+                if (id != null) Order(NafirWire.RemoveListener(id));
+                return id;
+            }
+            return null;
+        }
+
+        void LevelChanged(Dictionary<string, object> message)
+        {
+            var level = (string)message["level"];
+            if (!message.TryGetValue("listener", out var whose) || whose == null) Level = level;
+            else if (others.TryGetValue((string)whose, out var other)) other.Ears.Level = level;
+        }
+
         void Hear(byte[] data, int size)
         {
             lock (gate)
             {
                 if (!NafirWire.TryParse(data, size, block)) return;
-                if (block.Channels == 2)
-                {
-                    if (!hasBlock || block.SampleClock != nextClock) playback.Break();
-                    playback.Push(block.Samples, block.Frames);
-                }
+                var id = block.Listener == 0 ? null : IdOf(block.Listener);
+                if (block.Listener != 0 && id == null) return; // of one that was removed meanwhile
+                newest.Sequence = Math.Max(newest.Sequence, block.Sequence);
+                newest.SampleClock = Math.Max(newest.SampleClock, block.SampleClock);
                 sinceBlock.Restart();
                 counts.Blocks++;
                 if ((block.Flags & NafirBlock.Late) != 0) counts.BlocksLate++;
-                if (hasBlock && block.SampleClock > nextClock) counts.BlocksSkipped += (long)(block.SampleClock - nextClock) / block.Frames;
-                hasBlock = true;
-                nextClock = block.SampleClock + (ulong)block.Frames;
-                SampleClock = nextClock + clockOffset;
+                if (block.Sequence % AcknowledgeEvery == AcknowledgeEvery - 1) Say(NafirWire.Acknowledge(block.Sequence, id));
+                counts.BlocksSkipped += (id == null ? ears : others[id].Ears).Take(block);
+                if (id != null) return;
+                SampleClock = ears.NextClock + clockOffset;
                 HeardPoseId = block.PoseId;
                 HeardReverberationPoseId = block.ReverberationPoseId;
-                if (block.Sequence % AcknowledgeEvery == AcknowledgeEvery - 1) Say(NafirWire.Acknowledge(block.Sequence));
                 foreach (var pair in emitters)
                 {
                     var emitter = pair.Value;
@@ -626,6 +746,15 @@ namespace Nafir
                     }
                 }
             }
+        }
+
+        string IdOf(int number)
+        {
+            foreach (var pair in others)
+            {
+                if (pair.Value.Number == number) return pair.Key;
+            }
+            return null;
         }
 
         /// <summary>Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted
@@ -680,6 +809,14 @@ namespace Nafir
                 if (!emitter.Moved) continue;
                 emitter.Moved = false;
                 Say(NafirWire.MoveEmitter(pair.Key, ++poseId, emitter.Source.Pose));
+            }
+            foreach (var pair in others)
+            {
+                var other = pair.Value;
+                if (other.Refused != null && other.Refused.ElapsedMilliseconds > other.AskAgainMs) Ask(pair.Key, other);
+                if (other.Number < 0 || !other.Moved) continue;
+                other.Moved = false;
+                Say(NafirWire.Listener(++poseId, other.Pose, (byte)other.Number));
             }
             if (sincePing.ElapsedMilliseconds > PingMs)
             {

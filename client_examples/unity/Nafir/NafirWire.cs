@@ -14,7 +14,7 @@ namespace Nafir
 
         public uint Sequence, PoseId, ReverberationPoseId;
         public ulong SampleClock;
-        public byte Flags;
+        public byte Flags, Listener; // the number of who hears it: 0 for the first
         public int Channels, Frames;
         public float[] Samples = new float[0];
     }
@@ -51,11 +51,12 @@ namespace Nafir
         public static bool TryParse(byte[] data, int size, NafirBlock block)
         {
             if (size < AudioHeader || data[0] != 1) return false;
-            int channels = data[2] | data[3] << 8;
+            int channels = data[2];
             long frames = UInt(data, 24);
             if (channels == 0 || size - AudioHeader != 2 * channels * frames) return false;
             block.Flags = data[1];
             block.Channels = channels;
+            block.Listener = data[3];
             block.Sequence = UInt(data, 4);
             block.SampleClock = UInt(data, 8) | (ulong)UInt(data, 12) << 32;
             block.PoseId = UInt(data, 16);
@@ -67,11 +68,13 @@ namespace Nafir
             return true;
         }
 
-        /// <summary>The listener's pose. `poseId` rises over all poses of the stream, the listener's and the emitters'.</summary>
-        public static byte[] Listener(uint poseId, NafirPose pose)
+        /// <summary>A listener's pose. `poseId` rises over all poses of the stream, of listeners and emitters. `number` is that of a listener
+        /// beside the first.</summary>
+        public static byte[] Listener(uint poseId, NafirPose pose, byte number = 0)
         {
             var data = new byte[36];
             data[0] = 2;
+            data[1] = number;
             Put(data, 4, poseId);
             var numbers = Numbers(pose);
             for (int i = 0; i < numbers.Length; i++) Put(data, 8 + 4 * i, BitConverter.ToUInt32(BitConverter.GetBytes(numbers[i]), 0));
@@ -100,13 +103,15 @@ namespace Nafir
             return data;
         }
 
-        /// <summary>The first message. A `sampleRate` of 0 takes the scene's own, a `level` of null is the server's choice.</summary>
-        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null)
+        /// <summary>The first message. A `sampleRate` of 0 takes the scene's own, a `level` of null is the server's choice. `listeners` is how
+        /// many the stream is about to have.</summary>
+        public static string Hello(string scene, int sampleRate, int blockSize, int bufferBlocks, NafirPose listener, string level = null, int listeners = 1)
         {
+            var several = listeners > 1 ? $",\"listeners\":{listeners}" : "";
             var rate = sampleRate > 0 ? $",\"sample_rate\":{sampleRate}" : "";
             var quality = level != null ? $",\"level\":{NafirJson.Quote(level)}" : "";
             return $"{{\"type\":\"hello\",\"protocol\":{Protocol},\"scene\":{NafirJson.Quote(scene)},\"block_size\":{blockSize},\"encoding\":\"s16\","
-                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}}}";
+                + $"\"buffer_blocks\":{bufferBlocks},\"snapshots\":true,\"listener\":{{{Text(listener)}}}{rate}{quality}{several}}}";
         }
 
         /// <summary>The first message of a connection that goes on with a lost stream. `token` is that of the last welcome, `snapshot` the newest
@@ -154,12 +159,26 @@ namespace Nafir
 
         public static string RemoveEmitter(string id) => $"{{\"type\":\"remove_emitter\",\"id\":{NafirJson.Quote(id)}}}";
 
+        /// <summary>Adds a listener beside the first. A `head` of null is the server's default.</summary>
+        public static string AddListener(string id, NafirPose pose, string head)
+        {
+            var hrtf = head != null ? $",\"hrtf\":{NafirJson.Quote(head)}" : "";
+            return $"{{\"type\":\"add_listener\",\"id\":{NafirJson.Quote(id)},{Text(pose)}{hrtf}}}";
+        }
+
+        public static string RemoveListener(string id) => $"{{\"type\":\"remove_listener\",\"id\":{NafirJson.Quote(id)}}}";
+
         public static string SetLevel(string level) => $"{{\"type\":\"set_level\",\"level\":{NafirJson.Quote(level)}}}";
 
         public static string Ping(uint id) => $"{{\"type\":\"ping\",\"id\":{id}}}";
 
-        /// <summary>Every block up to `sequence` has arrived. Without it the server soon stops sending.</summary>
-        public static string Acknowledge(uint sequence) => $"{{\"type\":\"acknowledge\",\"sequence\":{sequence}}}";
+        /// <summary>Every block up to `sequence` has arrived, of the listener with this id or of the first (null). Without it the server soon
+        /// stops sending.</summary>
+        public static string Acknowledge(uint sequence, string listener = null)
+        {
+            var whose = listener != null ? $",\"listener\":{NafirJson.Quote(listener)}" : "";
+            return $"{{\"type\":\"acknowledge\",\"sequence\":{sequence}{whose}}}";
+        }
 
         static float[] Numbers(NafirPose pose)
         {

@@ -26,6 +26,33 @@ namespace
 	{
 		return FString(UTF8_TO_TCHAR(From.c_str()));
 	}
+
+	nafir::Pose HeadPose(const UObject* World, int32 Player)
+	{
+		const APlayerCameraManager* Camera = UGameplayStatics::GetPlayerCameraManager(World, Player);
+		return Camera ? PoseAt(Camera->GetCameraLocation(), Camera->GetCameraRotation().Quaternion()) : nafir::Pose();
+	}
+
+	/** The id of another player's listener. */
+	std::string NameOf(int32 Player)
+	{
+		return "player" + std::to_string(Player);
+	}
+
+	/** What a session or the ears of a listener have to play; silence without any. */
+	template <typename Source>
+	int32 Fill(Source* From, float* OutAudio, int32 NumSamples)
+	{
+		if (From)
+		{
+			From->Read(OutAudio, static_cast<std::size_t>(NumSamples / 2));
+		}
+		else
+		{
+			FMemory::Memzero(OutAudio, NumSamples * sizeof(float));
+		}
+		return NumSamples;
+	}
 }
 
 bool UNafirListener::Init(int32& SampleRate)
@@ -46,6 +73,7 @@ void UNafirListener::BeginPlay()
 	Options.output_rate = OutputRate;
 	Options.target_s = Buffer;
 	Options.give_up_after_s = GiveUpAfter;
+	Options.listeners = static_cast<std::size_t>(Listeners > 1 ? Listeners : 1);
 	Session = std::make_unique<nafir::Session>(Options);
 	Session->on_state = [this](nafir::State State)
 	{
@@ -59,7 +87,11 @@ void UNafirListener::BeginPlay()
 	{
 		UE_LOG(LogTemp, Warning, TEXT("Nafir: emitter %s: %s"), *FromText(Id), *FromText(Why));
 	};
-	Session->SetListener(HeadPose());
+	Session->on_listener_refused = [](const std::string& Id, const std::string& Why)
+	{
+		UE_LOG(LogTemp, Warning, TEXT("Nafir: listener %s: %s"), *FromText(Id), *FromText(Why));
+	};
+	Session->SetListener(HeadPose(this, 0));
 	Heard.store(Session.get(), std::memory_order_release);
 	Connect();
 	Start();
@@ -145,15 +177,7 @@ void UNafirListener::HandleBinary(const void* Data, SIZE_T Size, bool bIsLastFra
 
 int32 UNafirListener::OnGenerateAudio(float* OutAudio, int32 NumSamples)
 {
-	if (nafir::Session* From = Heard.load(std::memory_order_acquire))
-	{
-		From->Read(OutAudio, static_cast<std::size_t>(NumSamples / 2));
-	}
-	else
-	{
-		FMemory::Memzero(OutAudio, NumSamples * sizeof(float));
-	}
-	return NumSamples;
+	return Fill(Heard.load(std::memory_order_acquire), OutAudio, NumSamples);
 }
 
 void UNafirListener::TickComponent(float DeltaTime, ELevelTick TickType, FActorComponentTickFunction* ThisTickFunction)
@@ -163,7 +187,7 @@ void UNafirListener::TickComponent(float DeltaTime, ELevelTick TickType, FActorC
 	{
 		return;
 	}
-	Session->SetListener(HeadPose());
+	Session->SetListener(HeadPose(this, 0));
 	switch (Session->Step(DeltaTime))
 	{
 	case nafir::Session::Todo::kConnect:
@@ -195,12 +219,6 @@ void UNafirListener::TickComponent(float DeltaTime, ELevelTick TickType, FActorC
 			Socket->Send(Next->data.data(), Next->data.size(), true);
 		}
 	}
-}
-
-nafir::Pose UNafirListener::HeadPose() const
-{
-	const APlayerCameraManager* Camera = UGameplayStatics::GetPlayerCameraManager(this, 0);
-	return Camera ? PoseAt(Camera->GetCameraLocation(), Camera->GetCameraRotation().Quaternion()) : nafir::Pose();
 }
 
 void UNafirListener::AddClip(const FString& Id, const FString& Clip, FVector Location, float GainDb)
@@ -258,4 +276,50 @@ void UNafirListener::RemoveEmitter(const FString& Id)
 	{
 		Session->RemoveEmitter(ToText(Id));
 	}
+}
+
+bool UNafirAddedListener::Init(int32& SampleRate)
+{
+	NumChannels = 2;
+	return true;
+}
+
+void UNafirAddedListener::BeginPlay()
+{
+	Super::BeginPlay();
+	PrimaryComponentTick.SetTickFunctionEnable(true);
+	Start();
+}
+
+void UNafirAddedListener::EndPlay(const EEndPlayReason::Type EndPlayReason)
+{
+	Stop();
+	if (Ears && Listener && Listener->GetSession())
+	{
+		Listener->GetSession()->RemoveListener(NameOf(Player));
+	}
+	Super::EndPlay(EndPlayReason);
+}
+
+int32 UNafirAddedListener::OnGenerateAudio(float* OutAudio, int32 NumSamples)
+{
+	return Fill(Heard.load(std::memory_order_acquire), OutAudio, NumSamples);
+}
+
+void UNafirAddedListener::TickComponent(float DeltaTime, ELevelTick TickType, FActorComponentTickFunction* ThisTickFunction)
+{
+	Super::TickComponent(DeltaTime, TickType, ThisTickFunction);
+	nafir::Session* const Session = Listener ? Listener->GetSession() : nullptr;
+	if (!Session)
+	{
+		return;
+	}
+	const nafir::Pose Pose = HeadPose(this, Player);
+	if (Ears)
+	{
+		Session->MoveListener(NameOf(Player), Pose); // one who was refused is not there
+		return;
+	}
+	Ears = Session->AddListener(NameOf(Player), Pose, ToText(Head));
+	Heard.store(Ears.get(), std::memory_order_release);
 }

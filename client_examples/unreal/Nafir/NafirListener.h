@@ -1,4 +1,4 @@
-// Hears a scene of a Nafir server: a component of the player's pawn.
+// Hears a scene of a Nafir server: a component of the player's pawn, and one for other players.
 #pragma once
 
 #include <atomic>
@@ -49,6 +49,10 @@ public:
 	UPROPERTY(EditAnywhere, BlueprintReadWrite, Category = "Nafir")
 	float GiveUpAfter = 300.0f;
 
+	/** How many listeners there are going to be, with this one: the server keeps room for them. */
+	UPROPERTY(EditAnywhere, BlueprintReadWrite, Category = "Nafir")
+	int32 Listeners = 1;
+
 	/** The stream is live, was lost, or is over; the problem says why. */
 	UPROPERTY(BlueprintAssignable, Category = "Nafir")
 	FNafirStateChanged OnStateChanged;
@@ -97,11 +101,44 @@ private:
 	void Connect();
 	void Disconnect(const FString& Why, int32 Code);
 	void HandleBinary(const void* Data, SIZE_T Size, bool bIsLastFragment);
-	nafir::Pose HeadPose() const;
 
 	TSharedPtr<IWebSocket> Socket;
 	std::unique_ptr<nafir::Session> Session;
 	std::atomic<nafir::Session*> Heard{nullptr}; // by the audio thread; lives as long as the component
 	TArray<uint8> Message;
 	int32 OutputRate = 48000;
+};
+
+/**
+ * Another listener in the stream of a Nafir Listener, who hears the same emitters from another player's camera: a split screen, or a
+ * spectator. A component of that player's pawn, with a sound output of its own.
+ */
+UCLASS(ClassGroup = Audio, meta = (BlueprintSpawnableComponent))
+class UNafirAddedListener : public USynthComponent
+{
+	GENERATED_BODY()
+
+public:
+	/** Whose stream it is. */
+	UPROPERTY(EditAnywhere, BlueprintReadWrite, Category = "Nafir")
+	UNafirListener* Listener = nullptr;
+
+	/** The player whose camera hears; the Nafir Listener has that of player 0. One component for each player. */
+	UPROPERTY(EditAnywhere, BlueprintReadWrite, Category = "Nafir")
+	int32 Player = 1;
+
+	/** One of GET /v1/hrtfs; empty for the server's default. */
+	UPROPERTY(EditAnywhere, BlueprintReadWrite, Category = "Nafir")
+	FString Head;
+
+protected:
+	virtual bool Init(int32& SampleRate) override;
+	virtual int32 OnGenerateAudio(float* OutAudio, int32 NumSamples) override;
+	virtual void BeginPlay() override;
+	virtual void EndPlay(const EEndPlayReason::Type EndPlayReason) override;
+	virtual void TickComponent(float DeltaTime, ELevelTick TickType, FActorComponentTickFunction* ThisTickFunction) override;
+
+private:
+	std::shared_ptr<nafir::Ears> Ears;
+	std::atomic<nafir::Ears*> Heard{nullptr}; // by the audio thread; lives as long as the component
 };

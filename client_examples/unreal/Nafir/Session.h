@@ -1,10 +1,9 @@
 // A stream of /v1/stream, protocol 3, without its socket: messages in, messages out, and frames to play. It keeps what is wanted (poses,
-// emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
+// listeners, emitters, level). A server that has kept a lost stream goes on with it, and is sent what it had not got; else the stream begins anew.
 // C++17, no types of Unreal, no exceptions. All but Read is for one thread.
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <cstdint>
 #include <deque>
 #include <functional>
@@ -18,6 +17,7 @@
 #include <utility>
 #include <vector>
 
+#include "Ears.h"
 #include "Json.h"
 #include "Playback.h"
 #include "Pose.h"
@@ -34,7 +34,7 @@ inline const char* NameOf(State state) {
   return kNames[static_cast<int>(state)];
 }
 
-// Counts run over all connections of a stream. A block is skipped by the server, or lost with a connection.
+// Counts run over all connections and listeners of a stream; `underruns` and `waiting_s` are of the first listener. A block is skipped by the server, or lost with a connection.
 struct Statistics {
   std::uint64_t blocks = 0, blocks_late = 0, blocks_skipped = 0;
   unsigned underruns = 0, reconnections = 0, resumptions = 0;
@@ -49,6 +49,7 @@ struct SessionOptions {
   double output_rate = 48000;    // of Read
   double target_s = 0.06;        // held back against a network that stalls
   double give_up_after_s = 300;  // for so long a server that is gone is tried again
+  std::size_t listeners = 1;     // there are going to be so many, the first one included: the server keeps room for them
 };
 
 class Session {
@@ -65,12 +66,14 @@ class Session {
   std::function<void(const std::string& id)> on_emitter_added;                  // it is heard
   std::function<void(const std::string& id)> on_emitter_ended;                  // with its reverberation, or it cannot go on after a loss
   std::function<void(const std::string& id, const std::string& why)> on_emitter_refused;
+  std::function<void(const std::string& id)> on_listener_added;  // one beside the first; also where the stream began anew
+  std::function<void(const std::string& id, const std::string& why)> on_listener_refused;  // it is forgotten
 
   explicit Session(SessionOptions options) : options_(std::move(options)) {}
 
   State state() const { return state_; }
   const std::string& problem() const { return problem_; }  // why the stream was refused or last lost
-  const std::string& level() const { return level_; }
+  const std::string& level() const { return level_; }  // that the first listener hears
   int sample_rate() const { return sample_rate_; }  // 0 before the first welcome
   // The clock of the frame after the newest block, which goes on over lost connections.
   std::uint64_t sample_clock() const { return sample_clock_; }
@@ -78,10 +81,8 @@ class Session {
 
   Statistics statistics() const {
     Statistics found = counts_;
-    if (!playbacks_.empty()) {
-      found.underruns = playbacks_.back()->underruns();
-      found.waiting_s = playbacks_.back()->waiting_s();
-    }
+    found.underruns = ears_.underruns();
+    found.waiting_s = ears_.waiting_s();
     return found;
   }
 
@@ -90,6 +91,32 @@ class Session {
   void SetListener(const Pose& pose) {
     listener_ = pose;
     listener_moved_ = true;
+  }
+
+  // Adds a listener beside the first, who hears the same emitters: a player at a split screen, or a spectator. Returns the ears from which
+  // an audio thread reads. `head` is one of the server's; empty for its default. One with this id is moved.
+  std::shared_ptr<Ears> AddListener(const std::string& id, const Pose& pose, const std::string& head = {}) {
+    const auto [found, is_new] = others_.try_emplace(id);
+    Other& other = found->second;
+    other.pose = pose;
+    other.moved = true;
+    if (is_new) {
+      other.head = head;
+      Ask(id, other);
+    }
+    return other.ears;
+  }
+
+  // Moves a listener beside the first.
+  void MoveListener(const std::string& id, const Pose& pose) {
+    const auto found = others_.find(id);
+    if (found == others_.end()) return;
+    found->second.pose = pose;
+    found->second.moved = true;
+  }
+
+  void RemoveListener(const std::string& id) {
+    if (others_.erase(id) > 0) Order(message::RemoveListener(id));
   }
 
   // Adds an emitter, or moves the one with this id. Another clip than before begins anew.
@@ -187,8 +214,9 @@ class Session {
   }
 
   std::string FirstMessage() const {
-    if (CanResume()) return message::Resume(token_, snapshot_, has_block_ ? &block_ : nullptr);
-    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true);
+    if (CanResume()) return message::Resume(token_, snapshot_, ears_.has_block_ ? &newest_ : nullptr);
+    return message::Hello(options_.scene, options_.sample_rate, options_.block_size, kEncoding, options_.buffer_blocks, listener_, wanted_level_, true,
+                          std::max(options_.listeners, 1 + others_.size()));
   }
 
   // The connection has ended, with a close code if there was one, or there came none.
@@ -245,6 +273,11 @@ class Session {
       emitter.ask_again_s -= seconds;
       if (emitter.ask_again_s <= 0) Add(id, emitter);
     }
+    for (auto& [id, other] : others_) {
+      if (!other.is_refused) continue;
+      other.ask_again_s -= seconds;
+      if (other.ask_again_s <= 0) Ask(id, other);
+    }
     since_poses_s_ += seconds;
     if (since_poses_s_ >= kPoseIntervalS) SayPoses();
     return Todo::kNothing;
@@ -265,9 +298,12 @@ class Session {
       snapshot_ = message["snapshot"].Text();
       Handled(Count(message["handled"]));
     } else if (type == "level_changed") {
-      level_ = message["level"].Text();
+      LevelChanged(message["listener"].Text(), message["level"].Text());
     } else if (type == "pong") {
       if (message["id"].Number() == ping_id_) counts_.round_trip_s = since_ping_s_ + step_s_;
+    } else if (type == "listener_added") {
+      const bool is_news = Enter(id, static_cast<std::uint8_t>(Count(message["index"])));
+      if (is_news && on_listener_added) on_listener_added(id);
     } else if (type == "emitter_added") {
       const auto found = emitters_.find(id);
       if (found == emitters_.end()) return;
@@ -282,22 +318,27 @@ class Session {
   // Takes a binary message. Returns whether it was a block; another kind, or a damaged one, changes nothing.
   bool ReceiveBlock(const std::uint8_t* data, std::size_t size) {
     silent_s_ = 0;
-    std::optional<AudioBlock> parsed = ParseAudioBlock(data, size, kEncoding);
-    if (!parsed || parsed->channels != 2 || playbacks_.empty()) return false;
-    block_ = std::move(*parsed);
-    const std::uint64_t frames = block_.samples.size() / 2;
-    if (!has_block_ || block_.sample_clock != next_clock_) playbacks_.back()->Break();
-    if (has_block_ && block_.sample_clock > next_clock_ && frames > 0) counts_.blocks_skipped += (block_.sample_clock - next_clock_) / frames;
-    playbacks_.back()->Push(block_.samples.data(), frames);
+    const std::optional<AudioBlock> parsed = ParseAudioBlock(data, size, kEncoding);
+    if (!parsed || parsed->channels != 2 || !was_welcomed_) return false;
+    const AudioBlock& block = *parsed;
+    const auto whose = block.listener == 0 ? others_.end() : Numbered(block.listener);
+    if (block.listener != 0 && whose == others_.end()) return true;  // of one that was removed meanwhile
+    newest_.sequence = std::max(newest_.sequence, block.sequence);
+    newest_.sample_clock = std::max(newest_.sample_clock, block.sample_clock);
     ++counts_.blocks;
-    if (block_.flags & kLate) ++counts_.blocks_late;
-    has_block_ = true;
+    if (block.flags & kLate) ++counts_.blocks_late;
     since_block_s_ = 0;
-    next_clock_ = block_.sample_clock + frames;
-    sample_clock_ = next_clock_ + clock_offset_;
-    heard_pose_id_ = block_.pose_id;
-    if (block_.sequence % kAcknowledgeEvery == kAcknowledgeEvery - 1) Say(message::Acknowledge(block_.sequence));
-    for (auto& [id, emitter] : emitters_) SendDry(id, emitter, frames);
+    const bool is_to_be_acknowledged = block.sequence % kAcknowledgeEvery == kAcknowledgeEvery - 1;
+    if (whose != others_.end()) {
+      if (is_to_be_acknowledged) Say(message::Acknowledge(block.sequence, whose->first));
+      counts_.blocks_skipped += whose->second.ears->Take(block);
+      return true;
+    }
+    if (is_to_be_acknowledged) Say(message::Acknowledge(block.sequence));
+    counts_.blocks_skipped += ears_.Take(block);
+    sample_clock_ = ears_.next_clock_ + clock_offset_;
+    heard_pose_id_ = block.pose_id;
+    for (auto& [id, emitter] : emitters_) SendDry(id, emitter, block.sample_clock, block.samples.size() / 2);
     return true;
   }
 
@@ -309,14 +350,8 @@ class Session {
     return first;
   }
 
-  // Fills interleaved frames of both ears, on the audio thread: no locks, no allocation.
-  void Read(float* output, std::size_t frames) {
-    if (Playback* const from = playing_.load(std::memory_order_acquire)) {
-      from->Read(output, frames);
-    } else {
-      std::fill_n(output, 2 * frames, 0.0F);
-    }
-  }
+  // Fills interleaved frames of both ears of the first listener, on the audio thread: no locks, no allocation.
+  void Read(float* output, std::size_t frames) { ears_.Read(output, frames); }
 
  private:
   static constexpr Encoding kEncoding = Encoding::kInt16;
@@ -337,6 +372,17 @@ class Session {
     std::uint64_t start_clock = 0, sent_frames = 0;  // of the server
 
     bool PlaysOnce() const { return !source.clip.empty() && (!source.loop || is_stopped); }
+  };
+
+  // A listener beside the first.
+  struct Other {
+    std::shared_ptr<Ears> ears = std::make_shared<Ears>();  // the audio thread may keep them longer
+    Pose pose;
+    std::string head;
+    bool moved = false, has_been = false, is_refused = false;
+    double ask_again_s = 0;             // after a refusal
+    std::uint64_t order = 0;            // the number of the order that adds it
+    std::optional<std::uint8_t> number;  // in the headers of its blocks, once the server has it
   };
 
   static std::uint64_t Count(const Json& number) { return static_cast<std::uint64_t>(std::max(0.0, number.Number())); }
@@ -369,12 +415,8 @@ class Session {
     listener_moved_ = true;
     is_trying_ = false;
     attempt_ = 0;
-    if (playbacks_.empty() || playback_rate_ != sample_rate_) {
-      // The audio thread may be reading the last one still, so that it stays.
-      playbacks_.push_back(std::make_unique<Playback>(2, sample_rate_, options_.output_rate, options_.target_s));
-      playing_.store(playbacks_.back().get(), std::memory_order_release);
-      playback_rate_ = sample_rate_;
-    }
+    ears_.Open(sample_rate_, options_.output_rate, options_.target_s);
+    ears_.level_ = level_;
     const Json& resumed = message["resumed"];
     if (resumed.IsObject() && Count(resumed["handled"]) < ordered_ - orders_.size()) {
       Forget();  // some of what was said is gone, so the stream begins anew
@@ -384,12 +426,16 @@ class Session {
     if (was_welcomed_) ++counts_.reconnections;
     was_welcomed_ = true;
     state_ = State::kLive;  // so that what follows is said; the game is told once it has been
+    std::vector<std::string> entered;
     if (resumed.IsObject()) {
       GoOn(Count(resumed["handled"]), Count(resumed["sample_clock"]), static_cast<std::uint32_t>(Count(resumed["pose_id"])));
+      entered = GoOnHearing(Count(resumed["handled"]), resumed["listeners"]);
     } else {
       BeginAnew();
     }
     if (on_state) on_state(state_);
+    if (!on_listener_added) return;
+    for (const std::string& id : entered) on_listener_added(id);
   }
 
   // The server has the stream still: it gets what it has not handled, and where everything is now.
@@ -407,13 +453,34 @@ class Session {
     }
   }
 
+  // Listeners that the server has go on. Those that it should have and has not are asked for again. Returns the ids of those that are news.
+  std::vector<std::string> GoOnHearing(std::uint64_t handled, const Json& there) {
+    std::map<std::string, std::uint8_t> numbers;
+    for (const Json& each : there.Items()) numbers[each["id"].Text()] = static_cast<std::uint8_t>(Count(each["index"]));
+    std::vector<std::string> entered;
+    for (auto& [id, other] : others_) {
+      if (other.order > handled) continue;  // it is among what is sent again
+      const auto found = numbers.find(id);
+      if (found != numbers.end()) {
+        // That it is there may have been said just before the connection was lost.
+        if (Enter(id, found->second)) entered.push_back(id);
+      } else if (other.number) {
+        other.number.reset();  // an error says why it is gone
+      } else if (!other.is_refused) {
+        Ask(id, other);  // the answer was lost
+      }
+    }
+    return entered;
+  }
+
   // The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
   void BeginAnew() {
-    if (has_block_) {
+    if (ears_.has_block_) {
       const double away_s = std::max(0.0, since_block_s_ - static_cast<double>(options_.buffer_blocks * options_.block_size) / sample_rate_);
       clock_offset_ = sample_clock_ + static_cast<std::uint64_t>(away_s * sample_rate_);
     }
-    has_block_ = false;
+    ears_.BeginAnew();
+    newest_ = AudioBlock();
     snapshot_.clear();
     orders_.clear();
     ordered_ = 0;
@@ -421,6 +488,11 @@ class Session {
     // Not in the hello: a door that the scene lacks would end the stream.
     for (const auto& [door, openness] : doors_) Order(message::SetDoor(door, openness));
     doors_moved_.clear();
+    for (auto& [id, other] : others_) {  // before what they are to hear from its beginning
+      other.number.reset();
+      other.ears->BeginAnew();
+      Ask(id, other);
+    }
     std::vector<std::string> over;
     for (auto& [id, emitter] : emitters_) {
       if (emitter.is_heard && emitter.PlaysOnce()) {
@@ -457,10 +529,71 @@ class Session {
     emitter.number = ordered_;
   }
 
+  void Ask(const std::string& id, Other& other) {
+    other.is_refused = false;
+    Order(message::AddListener(id, other.pose, other.head));
+    other.order = ordered_;
+  }
+
+  // The server has a listener beside the first, under this number. Returns whether that is news.
+  bool Enter(const std::string& id, std::uint8_t number) {
+    const auto found = others_.find(id);
+    if (found == others_.end()) return false;  // removed meanwhile
+    Other& other = found->second;
+    const bool is_new = !other.number;
+    other.number = number;
+    other.has_been = other.moved = true;
+    other.ears->level_ = level_;
+    other.ears->Open(sample_rate_, options_.output_rate, options_.target_s);
+    return is_new;
+  }
+
+  std::map<std::string, Other>::iterator Numbered(std::uint8_t number) {
+    return std::find_if(others_.begin(), others_.end(), [number](const auto& pair) { return pair.second.number == number; });
+  }
+
+  void LevelChanged(const std::string& listener, const std::string& level) {
+    if (listener.empty()) {
+      level_ = ears_.level_ = level;
+    } else if (const auto found = others_.find(listener); found != others_.end()) {
+      found->second.ears->level_ = level;
+    }
+  }
+
+  // Takes an error about a listener. One who comes back with a new connection is asked for again when the server says; any other is
+  // forgotten. Returns whether it was.
+  bool RefusedListener(const std::string& id, const Json& error) {
+    const auto found = others_.find(id);
+    if (found == others_.end() || found->second.number || error["code"].Text() == "unknown_listener") return false;
+    Other& other = found->second;
+    other.ask_again_s = error["retry_after_s"].Number();
+    if (other.has_been && other.ask_again_s > 0) {
+      other.is_refused = true;
+      return false;
+    }
+    others_.erase(found);
+    if (on_listener_refused) on_listener_refused(id, problem_);
+    return true;
+  }
+
+  // A server that is too old to know what was asked does not say about whom it speaks. Had it not known another message, it would have the
+  // listener, who is removed for that.
+  void RefusedUnnamed(const Json& error) {
+    const auto found = std::find_if(others_.begin(), others_.end(), [](const auto& pair) { return !pair.second.number && !pair.second.is_refused; });
+    if (found == others_.end()) return;
+    const std::string id = found->first;
+    if (RefusedListener(id, error)) Order(message::RemoveListener(id));
+  }
+
   void Refused(const Json& error) {
     problem_ = error["code"].Text() + ": " + error["message"].Text();
+    if (!error["listener"].Text().empty()) {
+      RefusedListener(error["listener"].Text(), error);
+      return;
+    }
     const std::string& id = error["emitter"].Text();
     if (id.empty()) {
+      if (error["code"].Text() == "unknown_message") RefusedUnnamed(error);
       last_error_ = error;
       return;
     }
@@ -478,10 +611,11 @@ class Session {
     }
   }
 
-  void SendDry(const std::string& id, Emitter& emitter, std::uint64_t frames) {
-    if (!emitter.source.clip.empty() || !emitter.is_heard || block_.sample_clock < emitter.start_clock) return;
+  // The first listener has got a block of so many frames at a clock.
+  void SendDry(const std::string& id, Emitter& emitter, std::uint64_t clock, std::uint64_t frames) {
+    if (!emitter.source.clip.empty() || !emitter.is_heard || clock < emitter.start_clock) return;
     // The server's clock counts: as many samples as it has rendered, and a few blocks ahead.
-    const std::uint64_t due = block_.sample_clock - emitter.start_clock + (1 + kBlocksAhead) * frames;
+    const std::uint64_t due = clock - emitter.start_clock + (1 + kBlocksAhead) * frames;
     for (; emitter.sent_frames < due; emitter.sent_frames += frames) {
       dry_.resize(frames);
       emitter.dry->Read(dry_.data(), frames);
@@ -496,6 +630,12 @@ class Session {
       if (!emitter.moved || emitter.is_refused) continue;
       emitter.moved = false;
       Say(message::MoveEmitter(id, ++pose_id_, emitter.source.pose));
+    }
+    for (auto& [id, other] : others_) {
+      if (!other.moved || !other.number) continue;
+      other.moved = false;
+      const auto bytes = SerializeListener(++pose_id_, other.pose, *other.number);
+      SayBinary(bytes.data(), bytes.size());
     }
     if (!listener_moved_) return;
     listener_moved_ = false;
@@ -533,6 +673,7 @@ class Session {
   Pose listener_;
   bool listener_moved_ = false, is_trying_ = false, was_welcomed_ = false;
   bool is_to_drop_ = false;  // a connection that resumed a stream which cannot go on
+  std::map<std::string, Other> others_;  // listeners beside the first
   std::map<std::string, Emitter> emitters_;
   std::map<std::string, double> doors_;  // those that the game has moved
   std::set<std::string> doors_moved_;    // of them, while there was no connection
@@ -541,16 +682,14 @@ class Session {
   std::uint64_t ordered_ = 0;
   std::string token_, snapshot_;  // with which the stream is resumed
   Json last_error_;               // of the whole stream, in this connection
-  int attempt_ = 0, sample_rate_ = 0, playback_rate_ = 0, shots_ = 0;
+  int attempt_ = 0, sample_rate_ = 0, shots_ = 0;
   double wait_s_ = 0, since_lost_s_ = 0, since_block_s_ = 0, since_ping_s_ = 0, since_poses_s_ = 0, silent_s_ = 0;
   double step_s_ = 0;  // to which time is known
   std::uint32_t pose_id_ = 0, ping_id_ = 0, heard_pose_id_ = 0;
-  bool has_block_ = false;  // since the stream began; it is in block_
-  AudioBlock block_;
-  std::uint64_t next_clock_ = 0, clock_offset_ = 0, sample_clock_ = 0;  // of the server; what is added to it
+  AudioBlock newest_;  // the greatest sequence and clock of all listeners' blocks since the stream began
+  std::uint64_t clock_offset_ = 0, sample_clock_ = 0;  // what is added to the server's clock; the stream's
   std::vector<float> dry_;
-  std::vector<std::unique_ptr<Playback>> playbacks_;
-  std::atomic<Playback*> playing_{nullptr};
+  Ears ears_;  // of the first listener
   std::mt19937 luck_{std::random_device{}()};
 };
 

@@ -29,6 +29,7 @@ struct AudioBlock {
   std::uint32_t reverberation_pose_id = 0;
   std::uint8_t flags = 0;
   std::uint16_t channels = 0;
+  std::uint8_t listener = 0;  // the number of who hears it: 0 for the first
   std::vector<float> samples;
 };
 
@@ -122,7 +123,8 @@ inline std::optional<AudioBlock> ParseAudioBlock(const std::uint8_t* data, std::
   if (size < wire::kAudioHeaderBytes || data[0] != wire::kAudioBlock) return std::nullopt;
   AudioBlock block;
   block.flags = data[1];
-  block.channels = wire::Read<std::uint16_t>(data + 2);
+  block.channels = data[2];
+  block.listener = data[3];
   block.sequence = wire::Read<std::uint32_t>(data + 4);
   block.sample_clock = wire::Read<std::uint64_t>(data + 8);
   block.pose_id = wire::Read<std::uint32_t>(data + 16);
@@ -138,10 +140,12 @@ inline std::optional<AudioBlock> ParseAudioBlock(const std::uint8_t* data, std::
   return block;
 }
 
-// The listener's pose. `pose_id` rises over all poses of the stream, the listener's and the emitters'.
-inline std::array<std::uint8_t, wire::kListenerBytes> SerializeListener(std::uint32_t pose_id, const Pose& pose) {
+// A listener's pose. `pose_id` rises over all poses of the stream, of listeners and emitters. `number` is that of a listener beside the
+// first.
+inline std::array<std::uint8_t, wire::kListenerBytes> SerializeListener(std::uint32_t pose_id, const Pose& pose, std::uint8_t number = 0) {
   std::array<std::uint8_t, wire::kListenerBytes> data{};
   data[0] = wire::kListener;
+  data[1] = number;
   wire::Write(data.data() + 4, pose_id);
   const auto& [p, q] = pose;
   const double numbers[] = {p.x, p.y, p.z, q.x, q.y, q.z, q.w};
@@ -175,20 +179,21 @@ inline std::vector<std::uint8_t> SerializeDryBlock(std::string_view id, std::uin
 namespace message {
 
 // The first message. A `sample_rate` of 0 takes the scene's own; without a `level` the server chooses. With `snapshots` a server that has a
-// secret sends the stream's state now and then.
+// secret sends the stream's state now and then. `listeners` is how many the stream is about to have.
 inline std::string Hello(std::string_view scene, int sample_rate, int block_size, Encoding encoding, int buffer_blocks, const Pose& listener,
-                         std::string_view level = {}, bool snapshots = false) {
+                         std::string_view level = {}, bool snapshots = false, std::size_t listeners = 1) {
   std::string text = "{\"type\":\"hello\",\"protocol\":" + std::to_string(kProtocol) + ",\"scene\":" + wire::Quoted(scene) +
                      ",\"block_size\":" + std::to_string(block_size) + ",\"encoding\":\"" + NameOf(encoding) +
                      "\",\"buffer_blocks\":" + std::to_string(buffer_blocks) + ",\"listener\":{" + wire::Numbers(listener) + "}";
   if (sample_rate > 0) text += ",\"sample_rate\":" + std::to_string(sample_rate);
   if (!level.empty()) text += ",\"level\":" + wire::Quoted(level);
   if (snapshots) text += ",\"snapshots\":true";
+  if (listeners > 1) text += ",\"listeners\":" + std::to_string(listeners);
   return text + "}";
 }
 
 // The first message of a connection that goes on with a lost stream: the token of the last welcome and the newest snapshot, of which one may
-// be empty, and the last block that arrived, if one has.
+// be empty, and the last block that arrived, whoever's it is, if one has.
 inline std::string Resume(std::string_view token, std::string_view snapshot, const AudioBlock* last) {
   std::string text = "{\"type\":\"resume\",\"protocol\":" + std::to_string(kProtocol);
   if (!token.empty()) text += ",\"token\":" + wire::Quoted(token);
@@ -256,8 +261,21 @@ inline std::string SetDoor(std::string_view door, double openness) {
 
 inline std::string RemoveEmitter(std::string_view id) { return "{\"type\":\"remove_emitter\",\"id\":" + wire::Quoted(id) + "}"; }
 
-// Every block up to `sequence` has arrived. Without it the server soon stops sending.
-inline std::string Acknowledge(std::uint32_t sequence) { return "{\"type\":\"acknowledge\",\"sequence\":" + std::to_string(sequence) + "}"; }
+// Adds a listener beside the first. An empty `head` is the server's default.
+inline std::string AddListener(std::string_view id, const Pose& pose, std::string_view head = {}) {
+  std::string text = "{\"type\":\"add_listener\",\"id\":" + wire::Quoted(id) + "," + wire::Numbers(pose);
+  if (!head.empty()) text += ",\"hrtf\":" + wire::Quoted(head);
+  return text + "}";
+}
+
+inline std::string RemoveListener(std::string_view id) { return "{\"type\":\"remove_listener\",\"id\":" + wire::Quoted(id) + "}"; }
+
+// Every block up to `sequence` has arrived, of the listener with this id or of the first (none). Without it the server soon stops sending.
+inline std::string Acknowledge(std::uint32_t sequence, std::string_view listener = {}) {
+  std::string text = "{\"type\":\"acknowledge\",\"sequence\":" + std::to_string(sequence);
+  if (!listener.empty()) text += ",\"listener\":" + wire::Quoted(listener);
+  return text + "}";
+}
 
 }  // namespace message
 
