@@ -263,12 +263,18 @@ def uploaded(address):
     return [name for name in names if name.startswith("upload-")]
 
 
-# No schema can say that bytes are an audio file, so clips may be refused although they are as the document says.
+_EXAMPLES = 10
+"""Of each operation, at random, in a run: more runs have more."""
+
+# No schema can say that bytes are an audio file, so clips may be refused although they are as the document says. What
+# is wrong may be too long to be looked at (413), which schemathesis does not count among refusals by itself.
 _BY_ITS_DOCUMENT = f"""\
 request-timeout = 60.0
 [parameters]
 "path.scene" = "{SCENE}"
 "path.file" = "scene.json"
+[checks.negative_data_rejection]
+expected-statuses = ["400", "401", "403", "404", "405", "406", "409", "413", "415", "422", "428", "429", "5xx"]
 [[operations]]
 include-name = "POST /v1/clips"
 checks.positive_data_acceptance.expected-statuses = ["2xx", "413", "422", "503", "507"]
@@ -276,6 +282,9 @@ checks.positive_data_acceptance.expected-statuses = ["2xx", "413", "422", "503",
 
 
 def test_requests_by_the_document_are_answered_as_it_says(measured, server_pid, tmp_path):
+    """The first run has every case that schemathesis makes of the document, and a few at random; those after it have
+    others at random. How much a run asks bounds it, and how long an answer may take: a busy machine only takes longer
+    for it."""
     (tmp_path / "schemathesis.toml").write_text(_BY_ITS_DOCUMENT)
     seeds = iter(range(1, 1_000_000))
 
@@ -283,13 +292,15 @@ def test_requests_by_the_document_are_answered_as_it_says(measured, server_pid, 
         outcomes = Counter()
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
+            seed = next(seeds)
+            phases = "examples,coverage,fuzzing" if seed == 1 else "fuzzing"
             command = [
                 *(sys.executable, "-m", "schemathesis.cli", "run", f"http://{measured}/openapi.json"),
-                *("--checks", "all", "--seed", str(next(seeds)), "--max-examples", "20", "--no-color"),
-                *("--phases", "examples,coverage,fuzzing", "--max-response-time", "60"),
+                *("--checks", "all", "--seed", str(seed), "--max-examples", str(_EXAMPLES), "--no-color"),
+                *("--phases", phases, "--max-response-time", "60"),
             ]
-            ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=1_200, check=False)
-            assert ran.returncode == 0, ran.stdout + ran.stderr
+            ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+            assert ran.returncode == 0, f"seed {seed}\n{ran.stdout}{ran.stderr}"
             outcomes["runs"] += 1
         return outcomes
 
