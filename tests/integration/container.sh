@@ -8,8 +8,9 @@
 # Debian with its Python 3.13 (the 3.11 of the release before is too old for requirements.lock), in an image store of this
 # script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
 # for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
-# through the scene over WebSocket. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy: a key made meanwhile
-# opens it, and a client listens through wss. Neither start compiles anything.
+# through the scene over WebSocket. In the house it asks for a response with a door shut and open, and opens that door in a
+# stream. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy: a key made meanwhile opens it, and a client
+# listens through wss. Neither start compiles anything.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback; TLS_PORT=8443 that of Caddy, if it is installed
@@ -32,6 +33,8 @@ port=${PORT:-8000}
 tls_port=${TLS_PORT:-8443}
 scene=${SCENE:-apartment}
 query=${QUERY:-listener=1,2,1.5&emitter=6,3,1.5&yaw_deg=90}
+house_query='listener=2,3,1.6&emitter=6,2,1.5' # on both sides of this door
+house_door=living
 url=http://127.0.0.1:$port
 
 say() { printf '\n== %s\n' "$*"; }
@@ -154,28 +157,47 @@ mapfile -t check < <(run_podman image inspect "$image" --format '{{json .HealthC
 run_podman exec "$container" "${check[@]}" || fail "the health check fails on a ready server"
 echo "health check passes"
 
-say "asking for the page and an impulse response"
-page=$(curl --silent --show-error --fail "$url/")
-[[ ${page,,} == *"<!doctype html"* ]] || fail "no page at /"
-curl --silent --show-error --fail --output "$state/ir.wav" "$url/v1/scenes/$scene/impulse-response?$query"
-python3 - "$state/ir.wav" <<'PYTHON'
+# Stereo wavs of floats with sound in them, each ten decibels louder than the one before.
+check_responses() {
+    python3 - "$@" <<'PYTHON'
+import math
 import struct
 import sys
 
-data = open(sys.argv[1], "rb").read()
-assert data[:4] == b"RIFF" and data[8:12] == b"WAVE", f"not a wav: {data[:16]!r}"
-chunks, at = {}, 12
-while at + 8 <= len(data):
-    size = struct.unpack_from("<I", data, at + 4)[0]
-    chunks[data[at : at + 4]] = data[at + 8 : at + 8 + size]
-    at += 8 + size + size % 2
-code, channels, rate, _, _, bits = struct.unpack_from("<HHIIHH", chunks[b"fmt "])
-assert (channels, bits) == (2, 32), f"{channels} channels, {bits} bits"
-samples = struct.unpack(f"<{len(chunks[b'data']) // 4}f", chunks[b"data"])
-peak = max(map(abs, samples))
-assert 0 < peak < 1e3, f"peak {peak}"
-print(f"{len(data)} bytes: {len(samples) // channels} frames x {channels} at {rate} Hz, format {code}, peak {peak:.4f}")
+before_db = -math.inf
+for path in sys.argv[1:]:
+    data = open(path, "rb").read()
+    assert data[:4] == b"RIFF" and data[8:12] == b"WAVE", f"not a wav: {data[:16]!r}"
+    chunks, at = {}, 12
+    while at + 8 <= len(data):
+        size = struct.unpack_from("<I", data, at + 4)[0]
+        chunks[data[at : at + 4]] = data[at + 8 : at + 8 + size]
+        at += 8 + size + size % 2
+    code, channels, rate, _, _, bits = struct.unpack_from("<HHIIHH", chunks[b"fmt "])
+    assert (channels, bits) == (2, 32), f"{channels} channels, {bits} bits"
+    samples = struct.unpack(f"<{len(chunks[b'data']) // 4}f", chunks[b"data"])
+    peak = max(map(abs, samples))
+    assert 0 < peak < 1e3, f"peak {peak}"
+    energy_db = 10 * math.log10(sum(sample**2 for sample in samples))
+    frames = len(samples) // channels
+    print(f"{len(data)} bytes: {frames} frames x {channels} at {rate} Hz, format {code}, peak {peak:.4f}, {energy_db:.1f} dB")
+    assert energy_db > before_db + 10, f"{path} has {energy_db:.1f} dB, the one before {before_db:.1f}"
+    before_db = energy_db
 PYTHON
+}
+get() { curl --silent --show-error --fail "$@"; }
+
+say "asking for the page and an impulse response"
+page=$(get "$url/")
+[[ ${page,,} == *"<!doctype html"* ]] || fail "no page at /"
+get --output "$state/ir.wav" "$url/v1/scenes/$scene/impulse-response?$query"
+check_responses "$state/ir.wav"
+
+say "asking for the house with a door shut and open"
+for openness in 0 1; do
+    get --output "$state/door$openness.wav" "$url/v1/scenes/house/impulse-response?$house_query&door=$house_door=$openness"
+done
+check_responses "$state/door0.wav" "$state/door1.wav"
 
 say "walking through the scene for three seconds"
 # From inside, where what the client imports is installed; /dev/shm is the only place to write.
@@ -183,6 +205,39 @@ tar --create --directory "$root/client_examples/python" nafir_client walk.py |
     run_podman exec --interactive "$container" python -c "$unpack"
 run_podman exec "$container" python /dev/shm/walk.py --url "ws://127.0.0.1:$port" --scene "$scene" \
     --seconds 3 -o /dev/shm/heard.wav
+
+say "opening a door of the house in a stream"
+run_podman exec --interactive --workdir /dev/shm "$container" python - "ws://127.0.0.1:$port" "$house_door" <<'PYTHON'
+import asyncio
+import sys
+
+import nafir_client
+import numpy as np
+
+
+async def listen(url: str, door: str) -> None:
+    async with nafir_client.connect(url, scene="house", reconnect=None) as stream:
+        await stream.move_listener((2, 3, 1.6), yaw=0.0)
+        clip = await stream.add_emitter(clip="woman-reading", position=(6, 2, 1.5))
+        levels_db = []
+        # A second for what is to be computed, and two to be heard.
+        for openness in (0.0, 1.0):
+            await stream.set_door(door, openness)
+            start, heard = None, []
+            async for block in stream:
+                start = max(clip.start_clock, block.sample_clock) if start is None else start
+                if block.sample_clock >= start + stream.sample_rate:
+                    heard.append(block.samples)
+                if block.sample_clock >= start + 3 * stream.sample_rate:
+                    break
+            levels_db.append(10 * np.log10(np.mean(np.square(np.concatenate(heard, axis=1)))))
+        shut_db, open_db = levels_db
+        print(f"{door} shut {shut_db:.1f} dB, open {open_db:.1f} dB; {stream.statistics.blocks_late} blocks late")
+        assert open_db > shut_db + 10
+
+
+asyncio.run(listen(*sys.argv[1:]))
+PYTHON
 
 stop_server
 
