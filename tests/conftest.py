@@ -3,8 +3,10 @@
 Sound decays, is louder nearby (1 / distance), and louder in the ear on its side.
 """
 
+import gc
 import io
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -24,6 +26,7 @@ from server.assets.hrtfs import DEFAULT_HRTF, HrtfLibrary
 from server.field.field import AcousticField
 from server.field.fields_by_level import FieldsByLevel
 from server.rendering.hrtf import HeadFilters
+from server.runtime import memory
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.geometry import Geometry, Material, Materials, Opening
 from server.scene.manifest import Bounds, CodecParameters, FieldFile, Manifest, QualityLevel, Reuse, Start
@@ -77,6 +80,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             )
     turn = {name: number for number, name in enumerate(in_turn(list(names.values())))}
     items.sort(key=lambda item: turn[names[item.path]])
+
+
+def pytest_collection_finish() -> None:
+    """What all tests have imported stays: no collection looks through it, half a second each time."""
+    gc.freeze()
 
 
 def in_turn(names: Sequence[str]) -> list[str]:
@@ -194,6 +202,17 @@ def _name_of_test_client():
     """Starlette's test client asks for this name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NAFIR_ALLOWED_HOSTS", "testserver")
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _collections_of_servers() -> Iterator[None]:
+    """Servers within this process neither look through all that the tests have loaded when they begin, nor have it
+    looked through again once they end."""
+    with pytest.MonkeyPatch.context() as patch:
+        if (app := sys.modules.get("server.api.app")) is not None:
+            patch.setattr(app, "collect_rarely", lambda: gc.set_threshold(*memory._RARE_COLLECTIONS))
+            patch.setattr(app, "collect_as_usual", lambda: gc.set_threshold(*memory._USUAL_COLLECTIONS))
         yield
 
 

@@ -462,10 +462,10 @@ def test_emitters_that_have_left_cost_so_much_and_no_more(render):
             *({"remove": name} for name in names if number > 0),
             *({"emitter": radio(source)["emitter"] | {"id": name}} for name in names),
         ]
-        for number in range(60)
+        for number in range(20)
     }
     script[0].insert(0, standing(here))
-    assert render(60, script, np.full(256, 0.01)).said["most"] == 3 * len(names)
+    assert render(20, script, np.full(256, 0.01)).said["most"] == 3 * len(names)
 
 
 def test_an_emitter_that_leaves_after_many_others_makes_no_click(render):

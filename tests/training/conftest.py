@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from training.learning.runs import Configuration, claim
 from training.learning.train import train
 from training.models.encoders import FieldShape
 from training.parallel.jobs import LocalJobs
-from training.simulation import planner
+from training.simulation import planner, trial
 from training.simulation.level_predictions import LevelPredictions
 from training.simulation.plan_predictions import PlanPredictions
 from training.simulation.responses import SimulatedResponses
@@ -66,7 +67,7 @@ def brief_health_checks() -> Iterator[None]:
     """Enough to find what is wrong all over; exports are many here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "training.bundling.export.EFFORT", Effort(scattered=16, halved=4, climbing=2, responses=2, field_s=2.0)
+            "training.bundling.export.EFFORT", Effort(scattered=12, halved=2, climbing=1, responses=2, field_s=2.0)
         )
         yield
 
@@ -107,12 +108,12 @@ def _traced_once(tmp_path_factory) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _tried_once() -> Iterator[None]:
     """Predictions, whose trial takes a second, are kept for all plans of a scene and its probes: they follow from these
-    alone. Trials of large scenes are large, so few are kept."""
-    kept: dict[tuple[str, bytes], PlanPredictions | LevelPredictions] = {}
+    and from the trial's effort alone. Trials of large scenes are large, so few are kept."""
+    kept: dict[tuple[object, ...], PlanPredictions | LevelPredictions] = {}
 
     def predictions(scene: Any, probes: npt.NDArray[np.float64]) -> PlanPredictions | LevelPredictions:
         said = {name: value for name, value in scene.identity.items() if name != "effects"}
-        key = json.dumps(said), probes.tobytes()
+        key = json.dumps(said), probes.tobytes(), trial._OF_PLANS, trial._OF_LEVELS
         kind = LevelPredictions if isinstance(scene, LevelScene) else PlanPredictions
         found = kept.pop(key, None) or kind(scene, probes)
         if len(kept) == 4:
@@ -123,6 +124,17 @@ def _tried_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planner, "PlanPredictions", predictions)
         patch.setattr(planner, "LevelPredictions", predictions)
+        yield
+
+
+@pytest.fixture
+def brief_trials() -> Iterator[None]:
+    """Trials of few rays, for tests of what plans do whatever a trial finds."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_OF_PLANS", "_OF_LEVELS"):
+            effort = getattr(trial, name)
+            fewer = {limit: getattr(effort, limit) // 4 for limit in ("first_hits", "most_hits")}
+            patch.setattr(trial, name, replace(effort, emitters=effort.emitters // 2, **fewer))
         yield
 
 

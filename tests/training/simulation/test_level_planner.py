@@ -78,6 +78,7 @@ def test_a_level_is_planned_as_its_floor_plan(box):
             assert of_level[name].change_jnd == pytest.approx(of_plan[name].change_jnd, rel=0.5, abs=0.3), name
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_the_same_level_and_seed_have_the_same_plan_and_an_effect_is_on_where_its_change_reaches_the_threshold(box):
     level = level_of(two_rooms(box), door=sliding(surface_mass_kg_m2=5.0))
     predicted = [LevelPredictions(level, level.probe_positions(3)) for _ in range(2)]

@@ -70,6 +70,7 @@ def decided(planned):
     return decide
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_the_same_scene_has_the_same_plan(box):
     probes = box.probe_positions(3)
     one, other = (SimulationPlanner(PlanPredictions(box, probes)).plan({}) for _ in range(2))
@@ -110,6 +111,7 @@ def test_the_tail_is_shared_only_after_everything_has_mixed_everywhere(box, deci
     assert plan.tail_start_s == pytest.approx(farthest_m / 343 + 50.1e-3 + 0.0117e-3 * 30)
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_a_tail_that_would_start_after_the_response_is_not_shared(box, decided):
     short = box.simulation.model_copy(update={"duration_s": 0.25})
     hall = with_geometry(box, corners=((0, 0), (78, 0), (78, 3), (0, 3)))
@@ -163,6 +165,7 @@ def test_rays_are_traced_where_what_is_scattered_is_heard(box):
     assert plan.scattering
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_responses_shorter_than_reverberation_are_told(box):
     hard = with_materials(box, absorption=0.02)
     (note,) = planner_of(hard, 0).plan({}).notes
@@ -182,6 +185,7 @@ def test_responses_that_end_before_sound_arrives_are_refused(box):
         planner_of(corridor.model_copy(update={"start": start, "probes": grid}), 0)
 
 
+@pytest.mark.usefixtures("brief_trials")
 def test_bands_above_half_the_sample_rate_are_told_and_decide_nothing(box):
     """Materials of the 8 kHz band differ; at 8 kHz nobody hears it."""
     slow = box.model_copy(update={"simulation": box.simulation.model_copy(update={"sample_rate": 8000})})
