@@ -33,6 +33,11 @@ MEASURE ?= --half report
 FUZZ_SECONDS ?= 60
 # Folders with tests that watch the clock: collecting the others takes as long as many a test.
 TIMED := $(addprefix tests/,bench integration runtime streaming)
+# What kernels, NumPy, OpenBLAS and torch are told, so that they compute as on a processor without AVX-512, and tests of
+# what they compute. ONNX Runtime asks the processor itself.
+AVX2 := NUMBA_CPU_NAME=znver2 NUMBA_CPU_FEATURES=+sse4.2,+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+popcnt \
+	NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETYPE=Zen ATEN_CPU_CAPABILITY=avx2
+COMPUTING := $(addprefix tests/,acoustics field kernels rendering responses)
 # Pages of /docs and /redoc, kept in server/web/vendor.
 SWAGGER_UI := 5.35.0
 REDOC := 2.5.4
@@ -54,12 +59,12 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help serve test test-untimed lint format bundle scenes table tables office own-scenes meshes predictions container-test clean hard-cases fuzz
+.PHONY: help serve test test-untimed test-avx2 lint format bundle scenes table tables office own-scenes meshes predictions container-test clean hard-cases fuzz
 .PHONY: cluster-test long mutants attacks docs docs-serve results lock vendor audit deploy-check
 .PHONY: $(SCENES:%=bundle-%) $(SCENES:%=table-%) paper paper-scene paper-fractions paper-office $(SCENES:%=paper-of-%)
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 serve: $(VENV)/installed-server ## install the server and open a scene at http://127.0.0.1:8000 (HOST=, PORT=)
 	$(BIN)/nafir serve --host $(HOST) --port $(PORT)
@@ -71,6 +76,10 @@ test: $(VENV)/installed-dev ## install what tests need, then lint, check types a
 # What watches no clock runs beside others, and beside mypy, which uses one core.
 test-untimed: $(VENV)/installed-dev
 	$(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m 'not timed and not long and not cluster'
+
+test-avx2: $(VENV)/installed-dev ## tests of what is computed, on a processor with AVX-512 as if it had AVX2 alone
+	$(AVX2) $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder \
+		-m 'not timed and not long and not cluster' $(COMPUTING)
 
 lint: $(VENV)/installed-dev ## lint, check what imports what, and check types
 	$(BIN)/ruff check .

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, config
 from numba.extending import intrinsic, models, register_model
 
 _FLOAT = ir.FloatType()
@@ -51,9 +51,10 @@ _GROUP = 4
 _QUARTER_TURN = (1.5703125, 4.83751296997070312e-4, math.pi / 2 - 1.5703125 - 4.83751296997070312e-4)
 
 
-HAS_WIDE_REGISTERS: Final = bool(get_host_cpu_features().get("avx512f"))
-"""Whether a register holds sixteen float32, and there are 32 of them (AVX-512). Elsewhere there are sixteen of eight
-(AVX), or 32 of four (NEON)."""
+_features = get_host_cpu_features().flatten() if config.CPU_FEATURES is None else config.CPU_FEATURES
+HAS_WIDE_REGISTERS: Final = "+avx512f" in _features.split(",")
+"""Whether a register holds sixteen float32, and there are 32 of them (AVX-512), on this processor or on that for which
+NUMBA_CPU_FEATURES says to compile. Elsewhere there are sixteen of eight (AVX), or 32 of four (NEON)."""
 
 
 class Vector(types.Type):

@@ -45,8 +45,8 @@ def test_files_that_are_named_exist(document: Path) -> None:
 
 @names
 def test_make_targets_that_are_named_exist(document: Path) -> None:
-    targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    named = set(re.findall(r"^(?:[A-Z_]+=\S+ )*make (?:-j2 )?([a-z][a-z-]*)", code_in(document), re.MULTILINE))
+    targets = set(re.findall(r"^([a-z][a-z0-9-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = set(re.findall(r"^(?:[A-Z_]+=\S+ )*make (?:-j2 )?([a-z][a-z0-9-]*)", code_in(document), re.MULTILINE))
     assert named <= targets
 
 

@@ -638,3 +638,13 @@ def test_registers_of_any_width_make_the_same(tmp_path):
         subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[2])
         made[name] = np.load(file)
     assert_same(made["nehalem"], made["host"])
+
+
+@pytest.mark.parametrize(("features", "lanes"), [("", 8), ("+avx2,-avx512f", 8), ("+avx2,+avx512f", 16)])
+def test_the_widest_vectors_are_those_of_the_processor_that_code_is_compiled_for(features, lanes):
+    command = [sys.executable, "-c", "from server.kernels import simd; print(simd.WIDE_LANES)"]
+    environment = os.environ | {"NUMBA_CPU_FEATURES": features}
+    done = subprocess.run(
+        command, check=True, env=environment, cwd=Path(__file__).parents[2], capture_output=True, text=True
+    )
+    assert int(done.stdout) == lanes
