@@ -64,8 +64,18 @@ def test_a_busy_thread_renders_several_at_once_and_an_idle_one_block_by_block(st
         stage.clock.now_s += busy * BLOCK_S * stage.thread._blocks_of(stream)
 
     stream.session.begin_block = take_time
-    for busy, count in [(0.2, 1), (0.75, 2), (0.9, 8), (0.75, 8), (0.65, 2), (0.87, 8), (0.2, 1)]:
-        stage.run(4.0)
+    # Blocks are nearly late twice within seconds, so that it takes a while to be trusted that the load has gone.
+    a_while_s = 2 * THRESHOLDS.relapse_s + 5.0
+    for busy, count, for_s in [
+        (0.2, 1, 4.0),
+        (0.75, 2, 4.0),
+        (0.9, 8, 4.0),
+        (0.75, 8, 4.0),
+        (0.65, 2, 4.0),
+        (0.87, 8, 4.0),
+        (0.2, 1, a_while_s),
+    ]:
+        stage.run(for_s)
         batches = spy_on_batches(monkeypatch)
         stage.run(20 * BLOCK_S)
         assert {len(batch) for batch in batches} == {count}, busy
