@@ -12,7 +12,8 @@ tail. Reading gives the energies of whole responses.
 
 In a level with doors, each emitter is simulated with the doors in a state of its own, drawn at random
 (`training.data.door_states`). Such a file has another format, with the arrays `openness` (emitter, door) and `unseen`
-(emitter,).
+(emitter,). If emitters are heard at some of the probes only, the format is a third one, with the array `heard`
+(emitter, listener).
 
 The file keeps the plan that it was simulated by.
 """
@@ -44,6 +45,8 @@ SPEED_OF_SOUND = 343.0
 FORMAT = 5
 DOORS_FORMAT = 6
 """The format of datasets whose doors move."""
+SOME_FORMAT = 7
+"""The format of datasets whose emitters are heard at some of the probes only."""
 Half = Literal["choice", "report"]
 """Halves of the held-out pairs: quality levels are chosen by one, and their errors are reported on the other."""
 GEOMETRIC_ORDER: Literal[1] = 1
@@ -76,6 +79,8 @@ class Dataset:
     """(emitter, listener) True for pairs that training never sees."""
     effects: SimulationPlan
     states: DoorStates
+    heard: npt.NDArray[np.bool_]
+    """(emitter, listener) True for pairs that may be simulated."""
 
     @classmethod
     def create(cls, folder: Path, scene_path: Path, seed: int, effects: SimulationPlan) -> "Dataset":
@@ -99,6 +104,8 @@ class Dataset:
             held_out = states.held_out(rng)
         else:
             held_out = _choose_held_out(len(probes), scene.simulation.held_out_share, rng)
+        heard = _choose_heard(len(probes), scene.simulation.listeners, np.random.default_rng([seed, 15]))
+        held_out &= heard
         folder.mkdir(parents=True, exist_ok=True)
         scene_path = scene_path / SCENE_FILE if scene_path.is_dir() else scene_path
         (folder / SCENE_FILE).write_bytes(scene_path.read_bytes())
@@ -107,13 +114,15 @@ class Dataset:
         # The file gets its final name when it is whole: an interrupted start must not look like a damaged dataset.
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
-            file.attrs.update(
-                format=DOORS_FORMAT if has_doors else FORMAT, seed=seed, sample_rate=scene.simulation.sample_rate
-            )
+            hears_some = scene.simulation.listeners is not None
+            found = SOME_FORMAT if hears_some else DOORS_FORMAT if has_doors else FORMAT
+            file.attrs.update(format=found, seed=seed, sample_rate=scene.simulation.sample_rate)
             file.attrs["effects"] = json.dumps(effects.to_json())
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
             if has_doors:
                 file["openness"], file["unseen"] = states.openness, states.unseen
+            if hears_some:
+                file["heard"] = heard
             file.create_dataset("done", data=np.zeros(len(probes), dtype=bool))
             histogram = _histogram(scene, effects)
             file.create_dataset(
@@ -124,7 +133,7 @@ class Dataset:
                 fillvalue=-np.inf,
             )
         partial.replace(folder / "pairs.h5")
-        return cls(folder, scene, seed, probes, yaws, held_out, effects, states)
+        return cls(folder, scene, seed, probes, yaws, held_out, effects, states, heard)
 
     @classmethod
     def open(cls, folder: Path, *, finished: bool = True) -> "Dataset":
@@ -136,15 +145,15 @@ class Dataset:
             scene = read_scene(folder / SCENE_FILE)
             with h5py.File(folder / "pairs.h5", "r") as file:
                 found = file.attrs.get("format")
-                if found not in (FORMAT, DOORS_FORMAT):
+                if found not in (FORMAT, DOORS_FORMAT, SOME_FORMAT):
                     holds = f", which holds {_HOLDS[found]}" if found in _HOLDS else ""
                     raise DatasetError(
-                        f"{folder}: format {found}{holds}, expected {FORMAT} or {DOORS_FORMAT}: "
+                        f"{folder}: format {found}{holds}, expected {FORMAT} to {SOME_FORMAT}: "
                         "simulate into an empty folder"
                     )
                 done, probes = file["done"][()], file["probes"][()]
-                has_doors = found == DOORS_FORMAT
-                states = DoorStates(file["openness"][()], file["unseen"][()]) if has_doors else None
+                states = DoorStates(file["openness"][()], file["unseen"][()]) if "openness" in file else None
+                hears_all = np.ones((len(probes), len(probes)), dtype=bool)
                 dataset = cls(
                     folder,
                     scene,
@@ -154,6 +163,7 @@ class Dataset:
                     file["held_out"][()],
                     SimulationPlan.from_json(json.loads(file.attrs["effects"])),
                     states or DoorStates.none(len(probes)),
+                    file["heard"][()] if found == SOME_FORMAT else hears_all,
                 )
         except (OSError, KeyError, TypeError, ValueError) as exc:
             raise DatasetError(f"{folder}: not a dataset folder: {exc}") from exc
@@ -171,6 +181,7 @@ class Dataset:
             ("held_out", self.held_out, (len(self.probes), len(self.probes))),
             ("openness", self.states.openness, (len(self.probes), self._doors)),
             ("unseen", self.states.unseen, (len(self.probes),)),
+            ("heard", self.heard, (len(self.probes), len(self.probes))),
         ):
             if values.shape != shape or not np.isfinite(values).all():
                 raise DatasetError(f"{path}: {name}: has shape {values.shape}, expected {shape} of finite values")
@@ -232,9 +243,10 @@ class Dataset:
 
     @cached_property
     def trained(self) -> npt.NDArray[np.bool_]:
-        """(emitter, listener) True for pairs to train on. Neither these nor held out are a probe with itself, and pairs
-        in unseen states of doors whose reverse is trained on."""
-        return ~self.held_out & ~np.eye(len(self.probes), dtype=bool) & ~self.states.unseen[:, None]
+        """(emitter, listener) True for pairs to train on. Neither these nor held out are a probe with itself, pairs in
+        unseen states of doors whose reverse is trained on, and the reverse of pairs that are held out."""
+        held_out = self.held_out | self.held_out.T
+        return self.heard & ~held_out & ~np.eye(len(self.probes), dtype=bool) & ~self.states.unseen[:, None]
 
     def is_visible(self, pairs: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
         """(pair,) whether emitter and listener of pairs (pair, 2) see each other."""
@@ -315,6 +327,15 @@ def _histogram(scene: SceneFile | LevelScene, plan: SimulationPlan) -> tuple[int
     """The shape (direction, band, bin) of the energies that each pair stores."""
     bins = round(own_duration_s(scene, plan) / HISTOGRAM_BIN_S)
     return scene.simulation.arrival_directions, len(OCTAVE_BANDS_HZ), bins
+
+
+def _choose_heard(probes: int, listeners: int | None, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """(emitter, listener) True for so many listeners of each emitter, drawn at random; for None, for all."""
+    if listeners is None or listeners >= probes - 1:
+        return np.ones((probes, probes), dtype=bool)
+    order = rng.random((probes, probes))
+    np.fill_diagonal(order, np.inf)
+    return np.argsort(np.argsort(order, axis=1), axis=1) < listeners
 
 
 def _choose_held_out(probes: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from training.data.simulated_scene import SimulatedScene
 _Floats = npt.NDArray[np.float64]
 _Flags = npt.NDArray[np.bool_]
 
-_MOST_STATES, _FEWEST_STATES, _MOST_TRIANGLES = 128, 32, 2_000_000
+_MOST_STATES, _FEWEST_STATES, _MOST_TRIANGLES = 256, 32, 2_000_000
 """The geometry of each state is kept in memory while a dataset is read. So the meshes of all states together have at
 most so many triangles, unless the states are the fewest already."""
 _DECIMALS = 6
@@ -56,14 +56,14 @@ class DoorStates:
         return cls(openness[states], states < unseen)
 
     def held_out(self, rng: np.random.Generator) -> _Flags:
-        """(emitter, listener) True for half of the couples of which one end is unseen, in both directions: in the one
-        neither the couple nor the state is known, in the other the state may be."""
+        """(emitter, listener) True for pairs of half of the couples of which one end is unseen, while that end is the
+        emitter: so neither the state nor the couple is known."""
         first, second = np.triu_indices(len(self.unseen), 1)
         touching = np.flatnonzero(self.unseen[first] | self.unseen[second])
         chosen = rng.choice(touching, max(1, len(touching) // 2), replace=False)
         held_out = np.zeros((len(self.unseen), len(self.unseen)), dtype=bool)
         held_out[first[chosen], second[chosen]] = held_out[second[chosen], first[chosen]] = True
-        return held_out
+        return held_out & self.unseen[:, None]
 
 
 @dataclass(frozen=True)

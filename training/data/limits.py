@@ -2,3 +2,4 @@
 
 FEWEST_RAYS, MOST_RAYS = 100, 2_000_000
 """For each emitter."""
+FEWEST_LISTENERS = 8

@@ -7,7 +7,15 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from server.acoustics.geometry import Points
 from server.core.errors import NafirError
@@ -15,7 +23,7 @@ from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
 from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from server.scene.manifest import Air, Start
-from training.data.limits import FEWEST_RAYS, MOST_RAYS
+from training.data.limits import FEWEST_LISTENERS, FEWEST_RAYS, MOST_RAYS
 from training.data.scene_openings import faults_of
 from training.data.simulation_plan import SimulatedEffect
 
@@ -71,7 +79,8 @@ class Simulation(Strict):
     """Parameters of the simulation. `yaws` is at most 360 because listeners do not hear a head turn by less than one
     degree (Mills, J. Acoust. Soc. Am. 30, 1958). `arrival_directions` beyond the number that a head was measured in add
     nothing. The random error of `rays` falls with the square root of their number: a hundred times the usual number has
-    a tenth of an error that is inaudible already."""
+    a tenth of an error that is inaudible already. With `listeners`, each emitter is heard at so many of the other
+    probes, drawn at random, in place of all."""
 
     sample_rate: Annotated[int, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
     duration_s: Annotated[float, Field(ge=0.25, allow_inf_nan=False)]
@@ -80,6 +89,7 @@ class Simulation(Strict):
     image_order: Annotated[int, Field(ge=1, le=6)]
     arrival_directions: Annotated[int, Field(ge=6, le=1_000)]
     held_out_share: Annotated[float, Field(gt=0, lt=0.5)]
+    listeners: Annotated[int, Field(ge=FEWEST_LISTENERS)] | None = None
 
     @field_validator("duration_s")
     @classmethod
@@ -98,9 +108,21 @@ class Simulation(Strict):
             )
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_what_is_usual(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A scene that does not say `listeners` is the same as in versions that did not know them."""
+        said: dict[str, Any] = serialise(self)
+        if self.listeners is None:
+            said.pop("listeners", None)
+        return said
+
     @property
     def samples(self) -> int:
         return round(self.duration_s * self.sample_rate)
+
+    def listeners_of(self, probes: int) -> int:
+        """How many listeners an emitter has among so many probes."""
+        return max(0, min(probes - 1, self.listeners or probes))
 
     @property
     def histogram_bins(self) -> int:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from server.acoustics.sound_path import DESCRIPTION
+from training.models.doorways import Doorways
 from training.models.site import Extent, Reach
 
 _AZIMUTH_HARMONICS = 5
@@ -22,6 +23,7 @@ _PATH_DIRECTIONS = 2 + 2
 _POSITION_OCTAVES = 3
 _AJAR = 0.03
 """From this openness on, a network is told its logarithm, as levels go; below, a door is nearly shut."""
+_BLOCK = 4
 _EARS_M = 1.5
 """The height above a floor of its grid."""
 _MOST_LOG_PRECISION = 14.0
@@ -73,6 +75,53 @@ class FeatureGrid(nn.Module):
         return torch.softmax(squared * -precision, dim=-1) @ self._features
 
 
+class _DoorwaysBetween(nn.Module):
+    """Looks up which doors are between two places.
+
+    The grid of rooms is kept as blocks of 4 x 4 x 4 points, each kind of block once: most are within one room, and most
+    others alike.
+    """
+
+    _origin: Tensor
+    _last: Tensor
+    _block_strides: Tensor
+    _strides: Tensor
+    _blocks: Tensor
+    _rooms: Tensor
+    _on_the_way: Tensor
+
+    def __init__(self, doorways: Doorways) -> None:
+        super().__init__()
+        self._per_m = 1 / doorways.step_m
+        self._room_count = len(doorways.on_the_way)
+        sides = np.array(doorways.rooms.shape)
+        rooms = np.pad(doorways.rooms, [(0, -side % _BLOCK) for side in sides], mode="edge")
+        across = [side // _BLOCK for side in rooms.shape]
+        split = rooms.reshape(across[0], _BLOCK, across[1], _BLOCK, across[2], _BLOCK)
+        kinds, blocks = np.unique(split.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3), axis=0, return_inverse=True)
+        self._keep_as("origin", doorways.origin_m, np.float32)
+        self._keep_as("last", sides - 1, np.float32)
+        self._keep_as("block_strides", [across[1] * across[2], across[2], 1], np.float32)
+        self._keep_as("strides", [_BLOCK**2, _BLOCK, 1], np.float32)
+        self._keep_as("blocks", blocks.ravel(), np.int16 if len(kinds) < 2**15 else np.int32)
+        self._keep_as("rooms", kinds.ravel(), np.uint8)
+        self._keep_as("on_the_way", doorways.on_the_way.reshape(self._room_count**2, -1), np.float32)
+
+    def _keep_as(self, name: str, values: npt.ArrayLike, kind: npt.DTypeLike) -> None:
+        self.register_buffer(f"_{name}", torch.tensor(np.asarray(values, kind)), persistent=False)
+
+    def forward(self, ends: Tensor) -> Tensor:
+        """(B, door) 1 for doors between `ends` (B, 2, 3), else 0."""
+        steps = torch.clamp(torch.round((ends - self._origin) * self._per_m), min=0)
+        steps = torch.minimum(steps, self._last)
+        block = torch.floor(steps / _BLOCK)
+        # Whole numbers up to 2**24 are exact in single precision.
+        kind = self._blocks[(block * self._block_strides).sum(dim=-1).long()].long()
+        within = ((steps - _BLOCK * block) * self._strides).sum(dim=-1).long()
+        rooms = self._rooms[kind * _BLOCK**3 + within].long()
+        return self._on_the_way[rooms[:, 0] * self._room_count + rooms[:, 1]]
+
+
 class _Encoder(nn.Module):
     """Features of the path from emitter to listener, and of both ends.
 
@@ -107,6 +156,8 @@ class _Encoder(nn.Module):
         self._keep("octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves]))
         self._keep("octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES))
         self._keep("turns", np.array([[1, 0, 0, 1], [0, 1, -1, 0]]))
+        if extent.doorways is not None:
+            self._doorways = _DoorwaysBetween(extent.doorways)
 
     def sight(self, features: Tensor) -> Tensor:
         """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
@@ -125,7 +176,7 @@ class _Encoder(nn.Module):
         scalars = torch.cat([torch.log(distance), 1 / (1 + distance), (emitter - listener)[:, 2:] / distance], dim=-1)
         return torch.cat(
             [
-                *(part for shares in openness for part in (shares, torch.log(shares + _AJAR))),
+                *(part for shares in openness for part in self._of_doors(ends, shares)),
                 self._grid(ends).flatten(1),
                 self._waves(ends).flatten(1),
                 azimuth,
@@ -137,6 +188,14 @@ class _Encoder(nn.Module):
             ],
             dim=-1,
         )
+
+    def _of_doors(self, ends: Tensor, shares: Tensor) -> tuple[Tensor, ...]:
+        """What is told of doors that are open by `shares` (B, door): of all, and of those between the `ends` (B, 2, 3)
+        how far they are from open, of which nothing is left when they are."""
+        levels = torch.log(shares + _AJAR)
+        between = self._doorways(ends)
+        shut, losses = between * (1 - shares), between * (levels - float(np.log(1 + _AJAR)))
+        return shares, levels, shut, losses, losses.sum(dim=-1, keepdim=True)
 
     def _waves(self, position: Tensor) -> Tensor:
         scaled = (position - self._centre) / self._half_size

@@ -14,6 +14,7 @@ from training.data.dataset import SPEED_OF_SOUND
 from training.data.door_states import EmitterScenes, alike
 from training.data.levels.level_scene import LevelScene
 from training.data.responses import ResponseSet
+from training.models.doorways import Doorways
 from training.simulation.responses import SimulatedResponses
 
 _MARGIN_M = 0.5
@@ -52,6 +53,8 @@ class Extent:
     floors_m: tuple[float, ...] = ()
     doors: int = 0
     """The number of doors whose openness a field is told."""
+    doorways: Doorways | None = None
+    """Which of these doors are between which places."""
 
     @classmethod
     def of_plan(cls, plan: FloorPlan) -> "Extent":
@@ -63,7 +66,8 @@ class Extent:
     def of_level(cls, level: LevelScene, doors: int = 0) -> "Extent":
         low, high = level.surroundings.bounds_m
         has_obstacles = level.surroundings.has_obstacles
-        return cls(low, high, has_obstacles, tuple(floors_of(level.place.mesh)), doors)
+        doorways = Doorways.of_level(level) if doors else None
+        return cls(low, high, has_obstacles, tuple(floors_of(level.place.mesh)), doors, doorways)
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,19 @@ def predicted_s(simulation: PairSimulation) -> float:
     """Predict the seconds of one core for all emitters and pairs, with preparation. Measuring takes a fraction of a
     second, or more if code must be compiled first."""
     plan, probes = simulation.plan, len(simulation.probes)
+    listeners = simulation.scene.simulation.listeners_of(probes)
     brief = replace(simulation, plan=replace(plan, rays=min(plan.rays, _RAYS_TRIED)))
     many, few = (np.arange(1, 1 + min(count, probes - 1)) for count in (_LISTENERS_TRACED, _LISTENERS_TRIED))
     brief.energies(0, few, 0)  # the first run also compiles code
     many_traced_s, few_traced_s = (_seconds(partial(brief.energies, 0, some, 0)) for some in (many, few))
     # Every listener takes the same time.
     per_listener_s = (many_traced_s - few_traced_s) / max(1, len(many) - len(few))
-    tracing_s = many_traced_s + per_listener_s * (probes - 1 - len(many))
+    tracing_s = many_traced_s + per_listener_s * (listeners - len(many))
     # The second take has only the held-out listeners.
-    return simulation.prepared_s + probes * (tracing_s + few_traced_s) * plan.rays / max(brief.plan.rays, 1)
+    states = simulation.states
+    repeated = probes if states is None or not states.unseen.any() else int(states.unseen.sum())
+    of_rays_s = probes * tracing_s + repeated * few_traced_s
+    return float(simulation.prepared_s + of_rays_s * plan.rays / max(brief.plan.rays, 1))
 
 
 def is_brief(scene: SceneFile | LevelScene) -> bool:

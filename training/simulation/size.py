@@ -11,7 +11,7 @@ from training.data.levels.level_scene import LevelScene
 from training.data.scene_file import MOST_CELLS, SceneFile, SceneFileError, Simulation
 
 MOST_PROBES = 2_000
-"""The most probes. Each is heard from every other: four million pairs."""
+"""The most probes. If each is heard from every other, these are four million pairs."""
 MOST_DATASET_GB = 200.0
 MOST_MEMORY_GB = 8.0
 """The most memory for one emitter; each worker simulates one at a time."""
@@ -42,7 +42,7 @@ class SimulationSize:
 
     @property
     def pairs(self) -> int:
-        return self.probes * (self.probes - 1)
+        return _pairs(self.scene.simulation, self.probes)
 
     @property
     def dataset_gb(self) -> float:
@@ -73,7 +73,7 @@ class SimulationSize:
         """Seconds of one core to trace the rays of one emitter, in both takes."""
         settings, geometry = self.scene.simulation, self.scene.geometry
         hits = settings.rays * settings.duration_s * SPEED_OF_SOUND / self.mean_free_path_m
-        heard = self.probes * (1 + settings.held_out_share)
+        heard = settings.listeners_of(self.probes) * (1 + settings.held_out_share)
         return hits * (2 * (_HIT_S + _WALL_S * len(geometry.corners)) + _RECEIVER_S * heard)
 
     @property
@@ -154,19 +154,24 @@ def _pair_energies(simulation: Simulation) -> int:
     return simulation.arrival_directions * len(OCTAVE_BANDS_HZ) * simulation.histogram_bins
 
 
+def _pairs(simulation: Simulation, probes: int) -> int:
+    return probes * simulation.listeners_of(probes)
+
+
 def _dataset_gb(simulation: Simulation, probes: int) -> float:
-    return 2 * probes * (probes - 1) * _pair_energies(simulation) * (1 + simulation.held_out_share) / 1e9
+    return 2 * _pairs(simulation, probes) * _pair_energies(simulation) * (1 + simulation.held_out_share) / 1e9
 
 
 def _memory_gb(simulation: Simulation, probes: int) -> float:
     """The memory that a worker needs to simulate one emitter: the energies of its pairs, three times in single
     precision and once in half precision, and 24 bytes for each ray."""
-    return (14 * probes * _pair_energies(simulation) + 24 * simulation.rays) / 1e9
+    return (14 * simulation.listeners_of(probes) * _pair_energies(simulation) + 24 * simulation.rays) / 1e9
 
 
 def _extent(simulation: Simulation, probes: int) -> str:
     data, memory = _rounded(_dataset_gb(simulation, probes)), _rounded(_memory_gb(simulation, probes))
-    return f"{probes:,} probes, {probes * (probes - 1):,} pairs, {data} GB of data and {memory} GB of memory per worker"
+    pairs = _pairs(simulation, probes)
+    return f"{probes:,} probes, {pairs:,} pairs, {data} GB of data and {memory} GB of memory per worker"
 
 
 def level_extent(scene: LevelScene, probes: int) -> str:

@@ -33,6 +33,18 @@ def test_a_small_room_is_reasonable_and_counted_as_it_is(box):
     assert size.pairs == 30
 
 
+def test_with_fewer_listeners_there_are_fewer_pairs_and_less_of_everything(box):
+    many = with_(box, probes__spacing_m=0.15)
+    few = with_(many, simulation__listeners=10)
+    whole, part = SimulationSize(many), SimulationSize(few)
+    assert part.probes == whole.probes > 100
+    assert part.pairs == 10 * part.probes
+    for name in ("dataset_gb", "memory_gb", "core_minutes"):
+        assert getattr(part, name) < getattr(whole, name)
+    assert f"{part.pairs:,} pairs" in str(part)
+    assert SimulationSize(with_(box, simulation__listeners=10)).pairs == SimulationSize(box).pairs
+
+
 def test_data_are_as_much_as_a_file_of_them_holds(dataset: Dataset):
     """Of energies that are each pair's own for the whole duration, uncompressed."""
     size = SimulationSize(dataset.scene)
@@ -54,7 +66,7 @@ def test_data_are_as_much_as_a_file_of_them_holds(dataset: Dataset):
         ),
         ({"simulation__image_order": 6, "probes__spacing_m": 0.3}, None, ""),
         (
-            {"simulation__duration_s": 60.0, "simulation__arrival_directions": 1000, "simulation__yaws": 360},
+            {"simulation__duration_s": 80.0, "simulation__arrival_directions": 1000, "simulation__yaws": 360},
             "simulation.",
             "duration_s is in seconds, not milliseconds",
         ),
