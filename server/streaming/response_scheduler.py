@@ -130,9 +130,11 @@ class ResponseScheduler:
         return self.change_quality() if quality.level == self.heard.level else self.change_quality_unheard()
 
     def _share(self) -> None:
-        """Have emitters share at once what the step chosen last shares, whatever its level: IRs of another level may be
-        long in coming on a server that has too much to do, and shared ones take less time to render."""
-        self._effects.share(max(self.heard.sharing, self._wanted.sharing), self._emitters)
+        """Have emitters share what the heard step shares. Where load calls for another step, they share at once what
+        that one does, whatever its level: its IRs may be long in coming on a server that has too much to do, and shared
+        ones take less time to render."""
+        at_once = self._wanted.sharing if self._reason == "load" else Sharing.NOTHING
+        self._effects.share(max(self.heard.sharing, at_once), self._emitters)
 
     def change_quality_unheard(self) -> list[ServerMessage]:
         """Change to the step chosen last if no emitter has, or will have, an IR that differs between levels."""

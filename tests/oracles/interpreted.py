@@ -38,7 +38,10 @@ def _is_none(_size: object) -> bool:
 
 
 def _compile_nothing() -> None:
-    from server.kernels import compiled
+    from server.kernels import by_reference, compiled
+
+    # Of a reference, kernels that Python runs take what it refers to.
+    by_reference.value_of = lambda reference: reference.value
 
     def as_it_is(function: Callable[..., Any], **_options: bool) -> Callable[..., Any]:
         return function
