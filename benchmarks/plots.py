@@ -9,6 +9,7 @@ from itertools import groupby
 from typing import Final
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -220,18 +221,29 @@ def pictures_side_by_side(result: Result) -> Figure:
 
 
 def history(runs: Sequence[Run]) -> Figure:
-    """Draw the figures of a benchmark over its runs, divided by the figure's median, with a marker for each host. A
-    figure of one run among several is left out: it is its own median."""
+    """Draw the figures of a benchmark over its runs, divided by the figure's median, with a marker for each host and a
+    colour for each thing of which there are figures. A figure of one run among several is left out: it is its own
+    median."""
     count_of = Counter(name for run in runs for name, value in run.figures.items() if value is not None)
     names = [name for name, count in count_of.items() if count >= min(2, len(runs))]
     hosts = list(dict.fromkeys(run.host.name for run in runs))
+    things = list(dict.fromkeys(name.rpartition(", ")[0] for name in names))
+    drawn: Counter[str] = Counter()
     figure, axes = _one_panel(7.5, 2.4 + 0.12 * len(names))
     for name in names:
+        thing = name.rpartition(", ")[0]
         known = [(at, run, value) for at, run in enumerate(runs) if (value := run.figures.get(name)) is not None]
         middle = float(np.median([value for _, _, value in known])) if known else 0.0
         if not middle:
             continue
-        (line,) = axes.plot([at for at, _, _ in known], [value / middle for _, _, value in known], label=name)
+        (line,) = axes.plot(
+            [at for at, _, _ in known],
+            [value / middle for _, _, value in known],
+            color=colormaps["tab20"](things.index(thing) % 20),
+            linestyle=("-", "--", ":", "-.")[drawn[thing] % 4],
+            label=name,
+        )
+        drawn[thing] += 1
         for host, points in groupby(known, key=lambda point: point[1].host.name):
             marker = "osv^Dx+*"[hosts.index(host) % 8]
             for at, run, value in points:
@@ -239,6 +251,8 @@ def history(runs: Sequence[Run]) -> Figure:
                 axes.plot(at, value / middle, marker=marker, color=line.get_color(), markerfacecolor=face)
     axes.set_xticks(range(len(runs)), [f"{run.date:%Y-%m-%d}\n{run.commit[:7]}" for run in runs], fontsize=8)
     axes.set_xlim(-0.5, len(runs) - 0.5)
+    axes.set_yscale("log", base=2)
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_ylabel("times the median")
     axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
