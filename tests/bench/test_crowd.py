@@ -160,6 +160,21 @@ def test_each_listener_of_a_stream_walks_acknowledges_and_waits_for_itself():
     assert blocks == 5
 
 
+async def refusing(retry_after_s, when_asked):
+    """A server that tells everybody to come back after so many seconds."""
+
+    async def refuse(reader, writer):
+        when_asked()
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(
+            f"HTTP/1.1 503 Service Unavailable\r\nRetry-After: {retry_after_s}\r\nContent-Length: 0\r\n\r\n".encode()
+        )
+        writer.close()
+        await writer.wait_closed()
+
+    return await asyncio.start_server(refuse, "127.0.0.1", 0)
+
+
 def test_a_rush_asks_at_once_and_its_preparation_is_nobodys_wait():
     """Where emitters are is chosen before the first connects, and a wait begins when its client connects."""
     told: list[str] = []
@@ -172,15 +187,8 @@ def test_a_rush_asks_at_once_and_its_preparation_is_nobodys_wait():
             told.append("chosen")
             return [self.walk] * count
 
-    async def refuse(reader, writer):
-        told.append("asked")
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 7\r\nContent-Length: 0\r\n\r\n")
-        writer.close()
-        await writer.wait_closed()
-
     async def run():
-        async with await asyncio.start_server(refuse, "127.0.0.1", 0) as server:
+        async with await refusing(7, lambda: told.append("asked")) as server:
             crowd = Crowd(server.sockets[0].getsockname()[1], Chosen(), emitters=2, poses_per_s=0.0)
             before_s = time.monotonic()
             rush = await crowd.rush(5)
@@ -201,15 +209,8 @@ def test_those_who_were_refused_come_back_no_sooner_than_they_were_told_until_ti
     asked_s: list[float] = []
     places = Places.of(bundle_of("apartment"))
 
-    async def refuse(reader, writer):
-        asked_s.append(time.monotonic())
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\n\r\n")
-        writer.close()
-        await writer.wait_closed()
-
     async def run():
-        async with await asyncio.start_server(refuse, "127.0.0.1", 0) as server:
+        async with await refusing(1, lambda: asked_s.append(time.monotonic())) as server:
             crowd = Crowd(server.sockets[0].getsockname()[1], places, emitters=1, poses_per_s=0.0)
             rush = await crowd.rush(3)
             again = await crowd.come_back(rush.walkers, 1.5)

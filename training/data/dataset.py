@@ -115,8 +115,8 @@ class Dataset:
         partial = folder / "pairs.partial"
         with h5py.File(partial, "w") as file:
             hears_some = scene.simulation.listeners is not None
-            found = SOME_FORMAT if hears_some else DOORS_FORMAT if has_doors else FORMAT
-            file.attrs.update(format=found, seed=seed, sample_rate=scene.simulation.sample_rate)
+            version = SOME_FORMAT if hears_some else DOORS_FORMAT if has_doors else FORMAT
+            file.attrs.update(format=version, seed=seed, sample_rate=scene.simulation.sample_rate)
             file.attrs["effects"] = json.dumps(effects.to_json())
             file["probes"], file["yaws"], file["held_out"] = probes, yaws, held_out
             if has_doors:

@@ -24,6 +24,7 @@ _POSITION_OCTAVES = 3
 _AJAR = 0.03
 """From this openness on, a network is told its logarithm, as levels go; below, a door is nearly shut."""
 _BLOCK = 4
+"""Points along each side of a block of the grid of rooms."""
 _EARS_M = 1.5
 """The height above a floor of its grid."""
 _MOST_LOG_PRECISION = 14.0
@@ -75,6 +76,11 @@ class FeatureGrid(nn.Module):
         return torch.softmax(squared * -precision, dim=-1) @ self._features
 
 
+def _keep(module: nn.Module, name: str, values: npt.ArrayLike, kind: npt.DTypeLike = np.float32) -> None:
+    """Keep a constant that goes to devices and into graphs with a module, but into no checkpoint."""
+    module.register_buffer(f"_{name}", torch.tensor(np.asarray(values, kind)), persistent=False)
+
+
 class _DoorwaysBetween(nn.Module):
     """Looks up which doors are between two places.
 
@@ -99,16 +105,13 @@ class _DoorwaysBetween(nn.Module):
         across = [side // _BLOCK for side in rooms.shape]
         split = rooms.reshape(across[0], _BLOCK, across[1], _BLOCK, across[2], _BLOCK)
         kinds, blocks = np.unique(split.transpose(0, 2, 4, 1, 3, 5).reshape(-1, _BLOCK**3), axis=0, return_inverse=True)
-        self._keep_as("origin", doorways.origin_m, np.float32)
-        self._keep_as("last", sides - 1, np.float32)
-        self._keep_as("block_strides", [across[1] * across[2], across[2], 1], np.float32)
-        self._keep_as("strides", [_BLOCK**2, _BLOCK, 1], np.float32)
-        self._keep_as("blocks", blocks.ravel(), np.int16 if len(kinds) < 2**15 else np.int32)
-        self._keep_as("rooms", kinds.ravel(), np.uint8)
-        self._keep_as("on_the_way", doorways.on_the_way.reshape(self._room_count**2, -1), np.float32)
-
-    def _keep_as(self, name: str, values: npt.ArrayLike, kind: npt.DTypeLike) -> None:
-        self.register_buffer(f"_{name}", torch.tensor(np.asarray(values, kind)), persistent=False)
+        _keep(self, "origin", doorways.origin_m)
+        _keep(self, "last", sides - 1)
+        _keep(self, "block_strides", [across[1] * across[2], across[2], 1])
+        _keep(self, "strides", [_BLOCK**2, _BLOCK, 1])
+        _keep(self, "blocks", blocks.ravel(), np.int16 if len(kinds) < 2**15 else np.int32)
+        _keep(self, "rooms", kinds.ravel(), np.uint8)
+        _keep(self, "on_the_way", doorways.on_the_way.reshape(self._room_count**2, -1))
 
     def forward(self, ends: Tensor) -> Tensor:
         """(B, door) 1 for doors between `ends` (B, 2, 3), else 0."""
@@ -153,18 +156,15 @@ class _Encoder(nn.Module):
         self.register_buffer("_half_size", torch.tensor((box[1] - box[0]) / 2), persistent=False)
         quarter = np.pi / 2
         octaves = quarter * 2.0 ** np.arange(_POSITION_OCTAVES)
-        self._keep("octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves]))
-        self._keep("octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES))
-        self._keep("turns", np.array([[1, 0, 0, 1], [0, 1, -1, 0]]))
+        _keep(self, "octaves", np.hstack([np.tile(octave * np.eye(3), 2) for octave in octaves]))
+        _keep(self, "octave_phases", np.tile(np.repeat([0.0, quarter], 3), _POSITION_OCTAVES))
+        _keep(self, "turns", np.array([[1, 0, 0, 1], [0, 1, -1, 0]]))
         if extent.doorways is not None:
             self._doorways = _DoorwaysBetween(extent.doorways)
 
     def sight(self, features: Tensor) -> Tensor:
         """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
         return features[:, -self._after_sight - 1 : -self._after_sight]
-
-    def _keep(self, name: str, values: npt.NDArray[np.floating | np.integer]) -> None:
-        self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.float32), persistent=False)
 
     def _features(
         self, listener: Tensor, emitter: Tensor, path: Tensor, azimuth: Tensor, openness: Sequence[Tensor] = ()
@@ -236,9 +236,9 @@ class PoseEncoder(_Encoder):
         super().__init__(extent, shape, reach)
         turns_back = np.zeros((2 * _YAW_HARMONICS, 4))
         turns_back[[0, _YAW_HARMONICS]] = [[1, 0, 0, 1], [0, -1, 1, 0]]
-        self._keep("yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2))
-        self._keep("yaw_phases", np.repeat([np.pi / 2, 0.0], _YAW_HARMONICS))
-        self._keep("turns_back", turns_back)
+        _keep(self, "yaw_multiples", np.tile(np.arange(1, _YAW_HARMONICS + 1), 2))
+        _keep(self, "yaw_phases", np.repeat([np.pi / 2, 0.0], _YAW_HARMONICS))
+        _keep(self, "turns_back", turns_back)
         self.size = self(torch.zeros(1, 3), torch.ones(1, 3), torch.zeros(1), torch.zeros(1, DESCRIPTION)).shape[-1]
 
     def forward(self, listener: Tensor, emitter: Tensor, yaw: Tensor, path: Tensor) -> Tensor:
