@@ -84,15 +84,17 @@ LEVEL = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 def axes_of(orientation: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """The (3, 3) matrix from world axes to the axes of a head or emitter with this orientation (x, y, z, w)."""
-    x, y, z, w = map(float, orientation)
-    # This is the transpose of the usual matrix, as a flat tuple: nested rows take NumPy twice as long.
-    return np.array(
-        (
-            *(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-            *(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-            *(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-        )
-    ).reshape(3, 3)
+    # As a flat tuple: nested rows take NumPy twice as long.
+    return np.array(axis_coordinates(*map(float, orientation))).reshape(3, 3)
+
+
+def axis_coordinates(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
+    """The matrix of `axes_of`, row by row. It is the transpose of the usual one."""
+    return (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
+        *(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
+        *(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
+    )
 
 
 def yaws_of(heads: npt.ArrayLike) -> npt.NDArray[np.float64]:

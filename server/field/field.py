@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.fast_length import next_fast_length
-from server.acoustics.geometry import Vector3, orientations_of
+from server.acoustics.geometry import Pose, Vector3, orientations_of
 from server.acoustics.phase import FrozenNoise
 from server.acoustics.reflections import FirstEcho
 from server.acoustics.resampling import resampled_length
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
+_Places = Floats | Sequence[Vector3]
+"""Positions (B, 3)."""
 
 _CHUNK = 32
 _STATES = itertools.count()
@@ -131,6 +133,7 @@ class AcousticField:
     _at_first: "AcousticField | None" = None
     """The same field with doors as they are at the beginning, if this one is of another state of them."""
     _surroundings: Surroundings | None = None
+    _tail: BandTail | None = None
     _state: bytes = b""
     """What tells states of doors apart."""
     source: ResponseSource
@@ -158,7 +161,6 @@ class AcousticField:
             gives_back=self._first_echo is not None,
         )
         self._decoder: Decoder | None = None
-        self._tail: BandTail | None = None
         if graph.gives_responses:
             if level.frames is not None or level.phase != Phase():
                 raise BundleError(
@@ -174,7 +176,7 @@ class AcousticField:
                 frames=level.frames if self._tail is None else self._tail.early_frames,
             )
         self._cache = PhaseCache() if level.phase.warm else None
-        self._told: BoundedCache[bytes, _Told] = BoundedCache(_TOLD_BYTES)
+        self._told: BoundedCache[tuple[bytes, Vector3, Vector3], _Told] = BoundedCache(_TOLD_BYTES)
         node_cache = BoundedCache(NODE_CACHE_BYTES) if node_cache is None else node_cache
         self.source = self.kind.open(bundle, self._paths, self._compute_all, node_cache)
 
@@ -327,13 +329,27 @@ class AcousticField:
     ) -> Float32:
         """The first `samples` of what `impulse_responses` gives, remembering: for a level that decodes the beginning
         apart from the tail, in less time. Raises as that does."""
-        if self._tail is None or self._order is not None or self.kind.reuses_responses:
+        if not self.has_tail_apart:
             responses = self.impulse_responses(listeners, emitters, heads, remember=True)
             return np.ascontiguousarray(responses[..., :samples])
         listeners, emitters, heads = (np.asarray(a, dtype=np.float64) for a in (listeners, emitters, heads))
         if not _are_finite(listeners, emitters, heads):
             raise ValueError("listeners, emitters and heads must be finite")
         return self._with_tail(listeners, emitters, heads, remember=True, samples=samples)
+
+    def heard_by(self, listener: Pose, places: Sequence[Vector3], samples: int | None = None) -> Float32:
+        """Responses (B, 2, ir_samples) of emitters at `places` (B) to one listener, as `impulse_responses` gives them
+        remembering, in less time; with `samples`, only so many of each. Raises as that does. Only for a field that
+        `has_tail_apart`."""
+        positions = [listener.position] * len(places)
+        told = self._remembered(positions, places)
+        heads = np.array([listener.orientation] * len(places))
+        return self._at_heads(told, positions, places, heads, self.ir_samples if samples is None else samples)
+
+    @property
+    def has_tail_apart(self) -> bool:
+        """Whether each response to ears is computed for its pose, with a tail that is made apart from its beginning."""
+        return self._tail is not None and self._order is None and not self.kind.reuses_responses
 
     @property
     def knows_directions(self) -> bool:
@@ -435,10 +451,18 @@ class AcousticField:
         self, listeners: Floats, emitters: Floats, heads: Floats, *, remember: bool, samples: int
     ) -> Float32:
         """The first `samples` of responses of a level with a tail of bands."""
+        if remember:
+            told = self._remembered(*([tuple(place) for place in places.tolist()] for places in (listeners, emitters)))
+        else:
+            told = self._tell(listeners, emitters)
+        return self._at_heads(told, listeners, emitters, orientations_of(heads), samples)
+
+    def _at_heads(
+        self, told: _Told, listeners: _Places, emitters: _Places, orientations: Floats, samples: int
+    ) -> Float32:
+        """The first `samples` of responses to heads with these orientations (B, 4), from what their poses say."""
         assert self._tail is not None
         assert self._decoder is not None
-        told = self._remembered(listeners, emitters) if remember else self._tell(listeners, emitters)
-        orientations = orientations_of(heads)
         responses = self._tail.responses(self._decoder, told.arrivals, orientations, told.times.aligned, samples)
         self._gate.open(self._finite(responses, listeners, emitters), told.times.onsets, told.times.echoes)
         return responses
@@ -449,16 +473,17 @@ class AcousticField:
         times = self._times(listeners, emitters, paths)
         return _Told(self.graph.arrivals(listeners, emitters, paths), times)
 
-    def _remembered(self, listeners: Floats, emitters: Floats) -> _Told:
-        if len(listeners) == 1:  # as most often
-            keys = [self._state + listeners.tobytes() + emitters.tobytes()]
-        else:
-            pairs = zip(listeners, emitters, strict=True)
-            keys = [self._state + one.tobytes() + other.tobytes() for one, other in pairs]
+    def _remembered(self, listeners: Sequence[Vector3], emitters: Sequence[Vector3]) -> _Told:
+        """What poses (B) say, from memory where it is there. Raises ValueError for positions that are not finite."""
+        keys = [(self._state, *pair) for pair in zip(listeners, emitters, strict=True)]
         known = [self._told.get(key) for key in keys]
         missing = [row for row, told in enumerate(known) if told is None]
         if missing:
-            told = self._tell(listeners[missing], emitters[missing])
+            ears, places = (np.array([ends[row] for row in missing]) for ends in (listeners, emitters))
+            # guard: positions that are not finite say nothing that is remembered
+            if not _are_finite(ears, places):
+                raise ValueError("listeners and emitters must be finite")
+            told = self._tell(ears, places)
             for number, row in enumerate(missing):
                 known[row] = one = told.row(number) if len(missing) > 1 else told
                 self._told.put(keys[row], one, one.nbytes)
@@ -511,14 +536,14 @@ class AcousticField:
             cache.keep(*pose, responses[row])
         return np.ascontiguousarray(responses[:, : self.channels])
 
-    def _finite(self, responses: Float32, listeners: Floats, emitters: Floats) -> Float32:
+    def _finite(self, responses: Float32, listeners: _Places, emitters: _Places) -> Float32:
         """Return the responses unchanged. Raises FieldError naming the first that is not finite."""
         at = first_not_finite(responses)
         # guard: responses that are not finite are handed to nobody
         if at >= 0:
             raise FieldError(
                 f"scene {self.bundle.id}: field {self.graph.name} has no finite response for listener "
-                f"{listeners[at].tolist()} and emitter {emitters[at].tolist()}; nafir check finds out where else"
+                f"{_readable(listeners[at])} and emitter {_readable(emitters[at])}; nafir check finds out where else"
             )
         return responses
 
@@ -534,6 +559,10 @@ class AcousticField:
         for response, part, at in zip(responses, shifted, start, strict=True):
             add_from(part, response, at)
         return responses
+
+
+def _readable(position: Floats | Vector3) -> list[float]:
+    return [float(coordinate) for coordinate in position]
 
 
 def _are_finite(*poses: Floats) -> bool:

@@ -44,11 +44,10 @@ class Gate:
         """Apply the gate to responses in place. Sound arrives with sample `onsets` (B,). `echoes` (B,), if given, are
         the samples by which a surface can have reflected it: the response rises from silence over the last RISE_S
         before them. Raises ValueError if their numbers differ from that of the responses."""
-        begins = onsets if echoes is None else echoes
-        if not len(onsets) == len(begins) == len(responses):
-            raise ValueError(f"{len(onsets)} onsets and {len(begins)} echoes of {len(responses)} responses")
-        begins = begins - len(self._answer)
-        self._open(responses, onsets, begins)
+        echoes = onsets if echoes is None else echoes
+        if not len(onsets) == len(echoes) == len(responses):
+            raise ValueError(f"{len(onsets)} onsets and {len(echoes)} echoes of {len(responses)} responses")
+        self._open(responses, onsets, echoes)
 
     def gains(self, reference: Float32, onset: int, echo: int) -> npt.NDArray[np.float64]:
         """The factors by which `open` multiplies the first samples of one response (sample,), for others that are to
@@ -74,8 +73,8 @@ class Gate:
         gains[opens:until] *= np.sqrt(1 + share * given)
         return gains
 
-    def _open(self, responses: Float32, onsets: Indices, begins: Indices) -> None:
-        open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, begins, responses)
+    def _open(self, responses: Float32, onsets: Indices, echoes: Indices) -> None:
+        open_gates(self._rise, self._answer, self._given, MOST_GIVEN, onsets, echoes, responses)
 
 
 def _rise(samples: int) -> Float32:

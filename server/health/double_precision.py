@@ -130,9 +130,10 @@ class DoubleGate(Gate):
     def __init__(self, gate: Gate) -> None:
         self._rise, self._answer, self._given = gate._rise, gate._answer, gate._given
 
-    def _open(self, responses: _Float32, onsets: Indices, begins: Indices) -> None:
+    def _open(self, responses: _Float32, onsets: Indices, echoes: Indices) -> None:
         samples = np.arange(responses.shape[-1])
-        for response, onset, begin in zip(responses, onsets.tolist(), begins.tolist(), strict=True):
+        for response, onset, echo in zip(responses, onsets.tolist(), echoes.tolist(), strict=True):
+            begin = echo - len(self._answer)
             opens = max(0, onset, begin)
             gain = np.where(
                 samples < opens, 0.0, _at(self._rise, samples - onset, 1) * _at(self._answer, samples - begin, 1)

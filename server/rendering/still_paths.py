@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from server.acoustics.bands import in_filter_bands
-from server.acoustics.geometry import axes_of
 from server.acoustics.minimum_phase import band_cepstra
 from server.kernels.by_reference import Reference
 from server.rendering.direct_path import NEAR_LIMIT_M
@@ -70,7 +69,7 @@ class StillPaths:
         # One memory layout for each array, so that only one version is compiled.
         add_still_paths(
             self._tables,
-            axes_of(orientation),
+            np.array(orientation, np.float64),
             np.ascontiguousarray(lengths_m, np.float64),
             np.ascontiguousarray(arrivals, np.float64),
             np.ascontiguousarray(band_gains_db, np.float64),

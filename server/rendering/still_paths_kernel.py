@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 import server.rendering.path_loops as loops
+from server.acoustics.geometry import axis_coordinates
 from server.kernels.by_reference import Reference, value_of
 from server.kernels.compiled import compiled
 from server.kernels.copying import copy
@@ -20,6 +21,8 @@ from server.rendering.sphere import find_triangle
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+
+_axis_coordinates = compiled(axis_coordinates)
 
 
 class StillPathTables(NamedTuple):
@@ -43,16 +46,17 @@ class StillPathTables(NamedTuple):
 @compiled
 def add_still_paths(
     reference: Reference,
-    to_head: DoubleArray,
+    orientation: DoubleArray,
     lengths_m: DoubleArray,
     arrivals: DoubleArray,
     gains_db: DoubleArray,
     out: FloatArray,
 ) -> None:
     """Add to `out` (channel, sample) the responses of paths to a unit impulse at sample 0: lengths (path,), arrivals
-    (path, 3), gains (path, octave band). Channels are the ears or, for one ear, also 4, 9 or 16 ambisonic ones.
-    `reference` refers to StillPathTables."""
+    (path, 3), gains (path, octave band), at a head with this `orientation` (4,). Channels are the ears or, for one ear,
+    also 4, 9 or 16 ambisonic ones. `reference` refers to StillPathTables."""
     tables = value_of(reference)
+    to_head = np.array(_axis_coordinates(orientation[0], orientation[1], orientation[2], orientation[3])).reshape(3, 3)
     ears, count, bands = tables.cepstra.shape[1], tables.cepstra.shape[2], tables.band_cepstra.shape[0]
     wide = -(-(count + TAPS - 1) // loops.TILE) * loops.TILE
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)

@@ -230,6 +230,11 @@ class DirectSound:
         """Whether the direct sound is rendered apart from the fields' responses."""
         return self._filters is not None
 
+    @property
+    def leaves_field_as_it_is(self) -> bool:
+        """Whether the field's responses to ears are heard as the field gives them."""
+        return self.binauralization is None and self.field_gain == 1.0
+
     def ways_from(self, emitters: Iterable[tuple[Key, EmitterState]]) -> list["PathBatch[Key]"]:
         """Return path batches for emitters, each given with a key. Paths of emitters with occlusion may bend round
         corners; those of the others are straight."""
