@@ -122,17 +122,6 @@ def test_a_new_volume_for_what_is_compiled_can_be_written_by_any_user(tmp_path):
     assert list((tmp_path / folder).iterdir()) == []
 
 
-def test_the_test_of_the_image_runs_the_server_as_compose_does():
-    ran = (ROOT / "tests" / "integration" / "container.sh").read_text()
-    ran = ran[ran.index("# As deploy/compose.yaml runs it") :]
-    told = dict(re.findall(r"--env \"?(\w+)=([^\s\"]+)", ran))
-    assert of_compose().items() - {("NAFIR_ALLOWED_HOSTS", "word,server")} <= told.items()
-    mounted = {tuple(each.split(":")[1:]) for each in server_of_compose()["volumes"]}
-    assert mounted <= {tuple(each.split(":")) for each in re.findall(r"--volume \"?[^\s:]+:([^\s\"]+)", ran)}
-    assert f"--user {server_of_compose()['user']}" in ran
-    assert all(f"--tmpfs {each}" in ran for each in server_of_compose()["tmpfs"])
-
-
 @pytest.fixture(scope="module")
 def metrics():
     """Names of all metrics that a server has, from the reference."""

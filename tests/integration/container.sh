@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the container image and tries it as an operator would, where no Docker engine runs.
 #
-#   sudo apt-get install buildah podman runc mmdebstrap curl caddy
+#   sudo apt-get install buildah podman runc netavark mmdebstrap curl podman-compose caddy prometheus
 #   sudo make container-test
 #
 # The Dockerfile is built unmodified by buildah with `--isolation chroot`. Its base image is made here by mmdebstrap:
@@ -9,11 +9,11 @@
 # script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
 # for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
 # through the scene over WebSocket. In the house it asks for a response with a door shut and open, and opens that door in a
-# stream. Then it runs it as deploy/compose.yaml does, with keys and behind Caddy: a key made meanwhile opens it, and a client
-# listens through wss. Neither start compiles anything.
+# stream. Then podman-compose runs deploy/compose.yaml in its own networks, on ports 80 and 443: behind Caddy a key made
+# meanwhile opens the server, Prometheus reads its metrics, and a client listens through wss. Neither start compiles anything.
 #
 # Environment, all optional:
-#   PORT=8000            port on the host's loopback; TLS_PORT=8443 that of Caddy, if it is installed
+#   PORT=8000            port on the host's loopback, where the image is tried alone
 #   SCENE=apartment      scene to ask for
 #   QUERY=...            query of the impulse-response request
 #   CONTEXT=.            folder with the Dockerfile
@@ -30,7 +30,6 @@ base=${BASE_IMAGE:-python:3.13-slim}
 image=nafir:container-test
 container=nafir-container-test
 port=${PORT:-8000}
-tls_port=${TLS_PORT:-8443}
 scene=${SCENE:-apartment}
 query=${QUERY:-listener=1,2,1.5&emitter=6,3,1.5&yaw_deg=90}
 house_query='listener=2,3,1.6&emitter=6,2,1.5' # on both sides of this door
@@ -54,11 +53,14 @@ state=$(cd "$state" && pwd)
 store=(--root "$state/images" --runroot "$state/run")
 run_podman() { podman "${store[@]}" --runtime "$(command -v runc)" --cgroup-manager cgroupfs "$@"; }
 
-caddy=
+composed=
 ulimits=(--ulimit nofile=1024:1024 --ulimit nproc=4096:4096)
 unpack='import sys, tarfile; tarfile.open(fileobj=sys.stdin.buffer, mode="r|").extractall("/dev/shm", filter="data")'
 tear_down() {
-    [ -z "$caddy" ] || kill "$caddy" 2>/dev/null || true
+    if [ -n "$composed" ]; then
+        run_compose down --volumes || true
+        run_podman network rm --force nafir-test_front nafir-test_inside >/dev/null 2>&1 || true
+    fi
     run_podman rm --force --ignore "$container" >/dev/null 2>&1 || true
     if [ -z "$keep" ]; then
         run_podman rmi --all --force >/dev/null 2>&1 || true
@@ -241,32 +243,87 @@ PYTHON
 
 stop_server
 
-# As deploy/compose.yaml runs it: a folder of keys, a new volume for the cache, and Caddy with TLS in front. The networks of
-# compose take a plug-in and rights that such a machine often has not, so both stand on the host's; Caddy is the host's program.
-if command -v caddy >/dev/null; then
-    say "running it behind TLS, with keys"
-    secrets=$state/secrets/keys
-    mkdir -p "$secrets"
-    rm -f "$secrets/keys.json"
-    run_podman volume rm --force nafir-cache >/dev/null 2>&1 || true
-    nafir_keys() { run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$secrets:/keys" --user 0 "$image" keys "$@"; }
-    metrics_key=$(nafir_keys create --file /keys/keys.json --scope metrics)
-    chmod 644 "$secrets/keys.json"
-    start_server --tmpfs /tmp --user 10001:10001 --volume nafir-cache:/cache \
-        --volume "$secrets:/keys:ro" --env NAFIR_KEYS_FILE=/keys/keys.json \
-        --env NAFIR_REQUIRE_AUTH=true --env NAFIR_ALLOWED_HOSTS=localhost --env NAFIR_DRAIN_S=8 \
-        --env NAFIR_MAX_CONNECTIONS_PER_ADDRESS=1024
-    tls=https://localhost:$tls_port
-    HOME=$state XDG_DATA_HOME=$state/caddy XDG_CONFIG_HOME=$state/caddy DOMAIN=$tls UPSTREAM=127.0.0.1:$port \
-        caddy run --adapter caddyfile --config "$root/deploy/Caddyfile" 2>"$state/caddy.log" &
-    caddy=$!
-    authority=$state/caddy/caddy/pki/authorities/local/root.crt
-    until curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
-        kill -0 "$caddy" 2>/dev/null || { tail -5 "$state/caddy.log"; fail "Caddy stopped"; }
-        ((SECONDS - started < 180)) || { tail -5 "$state/caddy.log"; fail "not ready behind TLS after 180 s"; }
+# deploy/compose.yaml itself, in its own networks. Images that it names are pulled with PULL_BASE=1, or made of the base and the
+# program of this name that the host has; a service without either is left out.
+if ! command -v podman-compose >/dev/null; then
+    say "podman-compose is not installed: deploy/compose.yaml is not tried"
+else
+    say "running deploy/compose.yaml"
+    ! curl --silent --output /dev/null http://127.0.0.1:80 || fail "port 80, which Caddy takes, is in use"
+    deploy=$state/deploy
+    secrets=$deploy/secrets
+    rm -rf "$deploy"
+    cp --recursive "$root/deploy" "$deploy"
+    mkdir -p "$secrets/keys"
+    printf 'IMAGE=localhost/%s\nDOMAIN=localhost\n' "$image" >"$deploy/.env"
+    nafir_keys() { run_podman run --rm --no-healthcheck --network none "${ulimits[@]}" --volume "$secrets/keys:/keys" --user 0 "$image" keys "$@"; }
+    nafir_keys create --file /keys/keys.json --scope metrics >"$secrets/metrics-key"
+    echo container-test >"$secrets/grafana-password"
+    chmod 644 "$secrets/keys/keys.json" "$secrets/metrics-key" "$secrets/grafana-password"
+
+    make_image() {
+        mkdir -p "$state/$1"
+        cp "$(command -v "$1")" "$state/$1/program"
+        printf 'FROM localhost/%s\nCOPY program /usr/bin/%s\n%s\n' "$base" "$1" "$3" >"$state/$1/Dockerfile"
+        buildah "${store[@]}" bud --quiet --isolation chroot --format docker --pull-never --tag "$2" "$state/$1" >/dev/null
+    }
+    services=(server)
+    for wanted in $(sed -n 's/^ *image: \([a-z]\)/\1/p' "$deploy/compose.yaml"); do
+        service=${wanted##*/}
+        service=${service%%:*}
+        [[ $wanted = */* ]] || wanted=library/$wanted
+        wanted=docker.io/$wanted
+        if run_podman image exists "$wanted"; then
+            :
+        elif [ -n "${PULL_BASE:-}" ]; then
+            run_podman pull --quiet "$wanted"
+        elif [ "$service" = caddy ] && command -v caddy >/dev/null; then
+            make_image caddy "$wanted" 'ENV XDG_DATA_HOME=/data XDG_CONFIG_HOME=/config
+CMD ["caddy", "run", "--config", "/etc/caddy/Caddyfile", "--adapter", "caddyfile"]'
+        elif [ "$service" = prometheus ] && command -v prometheus >/dev/null; then
+            make_image prometheus "$wanted" 'RUN mkdir /prometheus && chown 65534:65534 /prometheus
+USER 65534
+ENTRYPOINT ["prometheus"]'
+        else
+            echo "$service is left out: it has no image"
+            continue
+        fi
+        services+=("$service")
+    done
+    [[ " ${services[*]} " = *" caddy "* ]] || fail "caddy is not installed"
+
+    # podman-compose's podman: the store of this script, and the limits that this host can give.
+    printf '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=4096:4096"]\n' >"$state/containers.conf"
+    cat >"$state/podman" <<PODMAN
+#!/usr/bin/env bash
+arguments=()
+for argument in "\$@"; do
+    # Where nobody may run at real-time priority. Podman asks for more processes than there may be unless it is told.
+    [[ \$argument != rtprio=* || $(ulimit -Hr) != 0 ]] || argument=nproc=4096:4096
+    arguments+=("\$argument")
+done
+CONTAINERS_CONF=$state/containers.conf exec $(command -v podman) ${store[*]} \
+    --runtime $(command -v runc) --cgroup-manager cgroupfs "\${arguments[@]}"
+PODMAN
+    chmod +x "$state/podman"
+    run_compose() { (cd "$deploy" && podman-compose --podman-path "$state/podman" --project-name nafir-test "$@") >>"$state/compose.log" 2>&1; }
+    : >"$state/compose.log"
+    composed=yes
+    started=$SECONDS
+    run_compose up --detach --no-build "${services[@]}" || { cat "$state/compose.log"; fail "compose does not start"; }
+    container=nafir-test_server_1
+    tls=https://localhost
+    authority=$state/root.crt
+    until run_podman cp nafir-test_caddy_1:/data/caddy/pki/authorities/local/root.crt "$authority" 2>/dev/null &&
+        curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
+        ((SECONDS - started < 180)) || { cat "$state/compose.log"; run_podman logs "$container"; fail "not ready behind TLS after 180 s"; }
         sleep 0.5
     done
+    echo "${services[*]}: ready behind TLS in $((SECONDS - started)) s"
+    ! run_podman logs "$container" 2>&1 | grep --quiet "compiling for this processor" ||
+        fail "it compiles what the image should hold"
     run_podman exec "$container" python -c 'open("/cache/probe", "w")' || fail "nothing can be kept in /cache"
+
     key=$(nafir_keys create --file /keys/keys.json --scope listen --scope render)
     status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
     [ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
@@ -275,25 +332,46 @@ if command -v caddy >/dev/null; then
         ((SECONDS - made < 20)) || fail "a key made while the server runs opens nothing after 20 s"
         sleep 0.5
     done
-    [ "$(status -H "Authorization: Bearer $metrics_key" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
-    [ "$(status -H "Authorization: Bearer $metrics_key" "$url/metrics")" = 200 ] || fail "Prometheus' key opens no metrics"
-    tar --create --directory "$root/client_examples/python" nafir_client --directory "$(dirname "$authority")" root.crt |
-        run_podman exec --interactive "$container" python -c "$unpack"
-    run_podman exec --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/dev/shm/root.crt --workdir /dev/shm "$container" python -c \
-        'from nafir_client.command_line import main; main()' listen "wss://localhost:$tls_port" --scene "$scene" \
-        --seconds 3 --silent --output heard.wav
-    run_podman exec --workdir /dev/shm "$container" python -c '
+    [ "$(status -H "Authorization: Bearer $(<"$secrets/metrics-key")" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
+    if [[ " ${services[*]} " = *" prometheus "* ]]; then
+        run_podman exec "$container" python -c '
+import json, time, urllib.request
+
+for _ in range(60):
+    (target,) = json.load(urllib.request.urlopen("http://prometheus:9090/api/v1/targets"))["data"]["activeTargets"]
+    if target["health"] == "up":
+        break
+    time.sleep(1)
+assert target["health"] == "up", target["lastError"]
+print("Prometheus reads", target["scrapeUrl"])
+'
+    fi
+    # From outside the networks of compose, through the port of Caddy, by a user who is not root.
+    chmod 644 "$authority"
+    run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$root/client_examples/python/nafir_client:/client/nafir_client:ro" \
+        --volume "$authority:/client/root.crt:ro" --workdir /client --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/client/root.crt \
+        --entrypoint python "$image" -c '
+import sys
+
 import soundfile
-samples, rate = soundfile.read("heard.wav")
+from nafir_client.command_line import main
+
+try:
+    main()
+except SystemExit as end:
+    if end.code:
+        raise
+samples, rate = soundfile.read("/dev/shm/heard.wav")
 peak = abs(samples).max()
 print(f"{len(samples) / rate:.2f} s heard through wss, peak {peak:.4f}")
 assert len(samples) > 2 * rate and 0.001 < peak <= 1, "silence"
-'
-    kill "$caddy"
-    wait "$caddy" || true
-    caddy=
-    stop_server
-else
-    say "Caddy is not installed: not tried behind TLS"
+' listen wss://localhost --scene "$scene" --seconds 3 --silent --output /dev/shm/heard.wav
+
+    say "stopping it"
+    started=$SECONDS
+    run_compose stop server
+    code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
+    echo "stopped in $((SECONDS - started)) s with exit code $code"
+    [ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
 fi
 say "container test passed"
