@@ -1,8 +1,8 @@
 // The plot of accuracy against time: one mark for each quality level on a logarithmic scale of milliseconds, small ones for levels that
 // were measured but are not offered, and the server's messages about the present level.
 //
-// One more level may be chosen: that the scene is rendered in this browser. It is a line at its cost, as measured here while it plays; how
-// accurate first-order ambisonics are through a head is not measured.
+// One more level may be chosen: that the scene is rendered in this browser. Its cost is measured here while it plays. Its error is that
+// of a server's bus of first order, which is the same sound; where that was not measured, it is a line at its cost.
 //
 // Errors are means over the metrics in just-noticeable differences (JND); smaller is better.
 
@@ -21,6 +21,7 @@ const milliseconds = (value) => `${value < 0.1 ? value.toPrecision(1) : value < 
 const costOf = (level) => level.ms_mean ?? level.ms_here;
 // The time measured here is for a new response. With levels that reuse responses, most poses of a walk need none.
 const hereOf = (level) => (level.ms_mean === null || level.ms_here === null ? level.ms_here : (level.ms_here * level.ms_mean) / level.ms_miss);
+const isSoundHere = (level) => level.bus === 1 && level.audible !== null;
 const isPlaced = (level) => level.audible !== null && costOf(level) !== null;
 
 function draw(name, attributes, parent, text) {
@@ -152,9 +153,11 @@ export class Frontier extends EventTarget {
     const { x, y } = this.#axes(placed);
     const floors = placed.map((level) => level.audible_floor).filter((floor) => floor !== null);
     if (floors.length > 0) this.#floor(y(Math.min(...floors)));
-    const line = [...placed].sort((a, b) => costOf(a) - costOf(b)).map((level) => `${x(costOf(level)).toFixed(1)} ${y(level.audible).toFixed(1)}`);
+    // A bus that is not offered is there for the browser's sake, and no step of the server's.
+    const steps = placed.filter(({ is_offered: isOffered, bus }) => isOffered || bus === null).sort((a, b) => costOf(a) - costOf(b));
+    const line = steps.map((level) => `${x(costOf(level)).toFixed(1)} ${y(level.audible).toFixed(1)}`);
     draw("path", { class: "through", d: `M${line.join("L")}` }, this.#chart);
-    if (this.#msHere !== null) this.#markHere(x(this.#msHere));
+    if (this.#msHere !== null) this.#markHere(x, y);
     for (const level of placed) this.#mark(level, x, y);
   }
 
@@ -189,10 +192,21 @@ export class Frontier extends EventTarget {
     draw("text", { x: WIDTH - MARGIN.right + 6, y: at + 3.5, class: "tick start floor-label" }, this.#chart, "floor");
   }
 
-  #markHere(at) {
-    const mark = draw("g", { class: this.#heard === HERE ? "in-browser heard" : "in-browser", "data-level": HERE }, this.#chart);
-    draw("path", { d: `M${at.toFixed(1)} ${MARGIN.top}V${HEIGHT - MARGIN.bottom}` }, mark);
-    draw("title", {}, mark, `In this browser: ${milliseconds(this.#msHere)} a response, measured here`);
+  #markHere(x, y) {
+    const isHeard = this.#heard === HERE;
+    const mark = draw("g", { class: isHeard ? "in-browser heard" : "in-browser", "data-level": HERE }, this.#chart);
+    const at = x(this.#msHere);
+    const sound = this.#levels.find(isSoundHere);
+    if (sound === undefined) {
+      draw("path", { d: `M${at.toFixed(1)} ${MARGIN.top}V${HEIGHT - MARGIN.bottom}` }, mark);
+    } else {
+      if (isHeard) draw("circle", { class: "halo", cx: at, cy: y(sound.audible), r: 8 }, mark);
+      draw("circle", { class: "dot", cx: at, cy: y(sound.audible), r: 4 }, mark);
+      draw("circle", { class: "touch", cx: at, cy: y(sound.audible), r: 11 }, mark);
+      mark.addEventListener("click", () => this.#choose(HERE));
+    }
+    const error = sound === undefined ? "" : `error ${sound.audible.toFixed(2)} JND, `;
+    draw("title", {}, mark, `In this browser: ${error}${milliseconds(this.#msHere)} a response, measured here`);
   }
 
   #mark(level, x, y) {

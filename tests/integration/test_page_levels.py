@@ -32,8 +32,9 @@ def several_levels(tmp_path_factory) -> Iterator[str]:
         return standard.model_copy(update={"name": name, "accuracy": accuracy, "cost": cost, **changes})
 
     levels = (level("standard", 1.0, 1.0), level("fine", 40.0, 0.9), level("quick", 0.1, 1.5, ir_rate_hz=20.0))
-    measured = FrontierPoint(level=level("near", 0.9, 1.05), architecture="factorised")
-    manifest = apartment.manifest.model_copy(update={"levels": levels, "frontier": (measured,)})
+    near = FrontierPoint(level=level("near", 0.9, 1.05), architecture="factorised")
+    bus = FrontierPoint(level=level("bus", 1.4, 1.3, bus=1), architecture="directional")
+    manifest = apartment.manifest.model_copy(update={"levels": levels, "frontier": (near, bus)})
     files = {name: (apartment.folder / name).read_bytes() for name in manifest.files}
     folder = tmp_path_factory.mktemp("scenes") / "apartment"
     write_bundle(folder, manifest, files)
@@ -52,9 +53,9 @@ def test_the_frontier_is_shown_and_levels_are_chosen_while_listening(browser, se
     assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"], "costlier is further right"
     assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"], "more accurate is lower"
     assert page.locator("#frontier .heard").count() == 0
-    (measured,) = page.locator("#frontier .measured").all()
-    assert measured.get_attribute("data-level") == "near"
-    assert boxes[0]["x"] < measured.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
+    near, bus = page.locator("#frontier .measured").all()
+    assert [near.get_attribute("data-level"), bus.get_attribute("data-level")] == ["near", "bus"]
+    assert boxes[0]["x"] < near.locator(".dot").bounding_box()["x"] < boxes[1]["x"]
     options = page.locator("#level-choice option").all()
     plain = ["Automatic", "In this browser", "Full, fine", "Full, standard", "At most 20 responses a second"]
     shown = [option.inner_text() for option in options]
@@ -132,7 +133,14 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     assert page.evaluate("nafir.state().playing")
     assert page.inner_text("#level") == "In this browser"
     page.wait_for_function("document.getElementById('field-cost').textContent.endsWith(' ms')")
-    assert page.locator("#frontier .in-browser.heard").count() == 1
+    # It errs as much as a bus of first order, at its own cost.
+    here, bus = (page.locator(f"#frontier [data-level={name}]") for name in ("in-this-browser", "bus"))
+    assert "heard" in here.get_attribute("class")
+    assert here.locator(".dot").get_attribute("cy") == bus.locator(".dot").get_attribute("cy")
+    error = re.match(r".*: (error [0-9.]+ JND)", bus.locator("title").text_content())[1]
+    assert re.fullmatch(
+        rf"In this browser: {error}, [0-9.]+ ms a response, measured here", here.locator("title").text_content()
+    )
     assert re.fullmatch(r"[0-9.]+\sms\shere", page.inner_text("#level-note"))
     assert page.inner_text("#part-server-name") == "This browser"
     turning = page.locator("#turning")
@@ -153,6 +161,10 @@ def test_a_scene_is_rendered_in_the_browser_as_one_more_level(browser, several_l
     assert turning.input_value() == "server"
     assert page.inner_text("#part-server-name") == "Server and network"
     assert page.locator("#frontier .in-browser.heard").count() == 0
+    here.locator(".touch").click()
+    page.wait_for_function("nafir.state().level === 'in-this-browser'")
+    page.select_option("#level-choice", "standard")
+    page.wait_for_function("nafir.state().level === 'standard'")
     wait_for_streams(1)
     assert level_db(listen(page)).max() > -60
     assert complaints == []

@@ -54,6 +54,13 @@ class Frontier:
     offered: tuple[Point, ...]
     """The points that a bundle should offer as quality levels, the default first."""
 
+    @property
+    def heard_by_clients(self) -> tuple[Point, ...]:
+        """The bus of first order of the default's field, if it was measured: clients that render a scene themselves
+        turn and decode the same ambisonic responses (`server/web/nafir/field/`)."""
+        field = self.default.level.field
+        return tuple(point for point in self.points if point.level.bus == 1 and point.level.field == field)
+
     def to_json(self) -> dict[str, Any]:
         """Plain values for `json.dumps`."""
         best = {point.level.name for point in self.best}
@@ -188,14 +195,15 @@ def with_levels(bundle: Bundle, levels: Sequence[QualityLevel], folder: Path) ->
 
 def record(bundle: Bundle, frontier: Frontier, folder: Path) -> Bundle:
     """Writes the bundle to `folder`, its own or another one, with the levels that it should offer, and records all
-    Pareto-optimal points."""
+    Pareto-optimal points, and what a client hears that renders the scene itself."""
     fields = bundle.manifest.fields
     offered = [point.level for point in frontier.offered]
+    kept = {point.level.name: point.level for point in (*frontier.best, *frontier.heard_by_clients)}
     points = []
-    for point in frontier.best:
-        if point.level not in offered:
-            file = fields[point.level.field]
-            points.append(FrontierPoint(level=point.level, architecture=file.architecture, rank=file.rank))
+    for level in kept.values():
+        if level not in offered:
+            file = fields[level.field]
+            points.append(FrontierPoint(level=level, architecture=file.architecture, rank=file.rank))
     measured = bundle.manifest.model_copy(update={"frontier": tuple(points)})
     return with_levels(dataclasses.replace(bundle, manifest=measured), offered, folder)
 

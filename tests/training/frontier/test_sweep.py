@@ -17,6 +17,7 @@ from server.rendering.hrtf import kemar
 from server.scene.bundle import Bundle, write_bundle
 from server.scene.manifest import ARRAYS_FILE, Phase, QualityLevel, Reuse
 from server.streaming.calibration import Listener
+from tests.directional_flat import write_directional
 from training.frontier.accuracy import Estimate, SampledPairs
 from training.frontier.candidates import candidates
 from training.frontier.figure import draw_frontier
@@ -133,6 +134,17 @@ def test_a_bundle_offers_the_optimal_levels_and_keeps_what_was_measured(frontier
     assert loaded.default.level == frontier.default.level
     assert loaded.default.level.cost is not None
     assert loaded.default.level.accuracy is not None
+
+
+@pytest.mark.parametrize(("bus", "kept"), [(1, ["bus"]), (2, [])])
+def test_what_clients_hear_that_render_the_scene_is_kept_though_it_is_not_optimal(frontier, tmp_path, bus, kept):
+    bundle = write_directional(tmp_path / "flat", order=2)
+    level = frontier.default.level.model_copy(update={"field": "directional"})
+    default = replace(frontier.default, level=level)
+    by_bus = replace(default, level=level.model_copy(update={"name": "bus", "bus": bus}))
+    measured = replace(frontier, points=(default, by_bus), best=(default,), default=default, offered=(default,))
+    written = record(bundle, measured, tmp_path / "written")
+    assert [point.level.name for point in written.manifest.frontier] == kept
 
 
 def test_the_document_names_every_point_and_the_picture_is_drawn(frontier, tmp_path) -> None:
