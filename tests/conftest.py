@@ -82,9 +82,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: turn[names[item.path]])
 
 
-def pytest_collection_finish() -> None:
-    """What all tests have imported stays: no collection looks through it, half a second each time."""
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Iterator[None]:  # noqa: ARG001  pytest looks for the name
+    """What all tests have imported stays: the collector of garbage looks through it neither while it comes, which takes
+    a fifth of that time, nor later, half a second each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def in_turn(names: Sequence[str]) -> list[str]:

@@ -26,11 +26,12 @@ from server.scene.bundle import Bundle, bundled_scenes
 
 ROOT = Path(__file__).parents[2]
 BOUND_DB = -90.0
-MESH = {folder.name: Bundle.load(folder).mesh is not None for folder in bundled_scenes()}
+BUNDLES = {folder.name: Bundle.load(folder) for folder in bundled_scenes()}
+MESH = {scene: bundle.mesh is not None for scene, bundle in BUNDLES.items()}
 LEVELS = [
-    pytest.param(folder.name, name, id=f"{folder.name} {name}")
-    for folder in bundled_scenes()
-    for name in FieldsByLevel.load(Bundle.load(folder))
+    pytest.param(scene, level.name, id=f"{scene} {level.name}")
+    for scene, bundle in BUNDLES.items()
+    for level in bundle.manifest.levels
 ]
 WALKS = [
     # With nothing compiled, the ways round the edges of a mesh take minutes to find.
@@ -117,7 +118,7 @@ def test_a_walk_is_heard_as_in_double_precision(walks, scene, level, measured):
 
 @pytest.mark.parametrize(("scene", "level"), LEVELS)
 def test_a_listener_at_rest_hears_a_convolution_with_exact_responses(scene, level, measured):
-    levels = FieldsByLevel.load(Bundle.load(next(folder for folder in bundled_scenes() if folder.name == scene)))
+    levels = FieldsByLevel.load(BUNDLES[scene])
     field, start = levels[level], levels.bundle.manifest.start
     head = kemar(field.sample_rate)
     clip = 0.02 * np.random.default_rng(4).standard_normal(4_000).astype(np.float32)
