@@ -15,7 +15,14 @@ import numpy.typing as npt
 
 from server.acoustics.minimum_phase import excess_delays_samples, folded_cepstrum
 from server.rendering.sofa import HeadMeasurements, HrtfError, portions, read_sofa
-from server.rendering.sphere import CoverageError, Triangulation, fill_gaps, solid_angles, triangulate
+from server.rendering.sphere import (
+    CoverageError,
+    Triangulation,
+    fill_gaps,
+    solid_angles,
+    triangles_by_cell,
+    triangulate,
+)
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -213,6 +220,11 @@ class HeadFilters:
         return filters
 
     @cached_property
+    def triangles_by_cell(self) -> npt.NDArray[np.int64]:
+        """(cell,) a triangle near each cell of `server.rendering.sphere.cube_cell`."""
+        return triangles_by_cell(self.directions, self.triangulation.triangles)
+
+    @cached_property
     def solid_angles(self) -> _Floats:
         """(d,) share of the sphere that is nearest to each direction."""
         return solid_angles(self.directions)
@@ -257,6 +269,7 @@ class NoHead:
         self.taps = filter_taps(sample_rate)
         self.cepstra = np.zeros((1, 1, self.taps), np.float32)
         self.delays_s = np.zeros((1, 1))
+        self.triangles_by_cell = np.zeros(0, np.int64)
         self.triangulation = Triangulation(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3)))
 
 

@@ -21,6 +21,8 @@ _WIDEST_GAP = np.radians(30)
 _SAME_CONE = np.radians(10)
 _SAME_SIDE = np.radians(60)
 _SPHERE_POINTS = 20_000
+CUBE_CELLS = 8
+"""Cells along an edge of the cube of `cube_cell`."""
 
 
 class CoverageError(NafirError):
@@ -34,6 +36,23 @@ class Triangulation(NamedTuple):
     """(t, 3) the triangle on the other side of the edge opposite each corner."""
     inverses: _Floats
     """(t, 3, 3) matrices that convert a direction to its weights w."""
+
+
+@compiled_in_place
+def cube_cell(direction: _Floats) -> int:
+    """The number of the cell of a cube around the head through which `direction` (3,) leaves: CUBE_CELLS**2 squares on
+    each face, which are the faces ahead, behind, left, right, above and below."""
+    axis = 0
+    for other in range(1, 3):
+        if abs(direction[other]) > abs(direction[axis]):
+            axis = other
+    reach = abs(direction[axis])
+    # guard: what is no direction leaves through some cell too
+    half = 0.5 * CUBE_CELLS / reach if reach > 0.0 else 0.0
+    row = max(0, min(CUBE_CELLS - 1, int(half * direction[(axis + 1) % 3] + 0.5 * CUBE_CELLS)))
+    column = max(0, min(CUBE_CELLS - 1, int(half * direction[(axis + 2) % 3] + 0.5 * CUBE_CELLS)))
+    face = 2 * axis + (1 if direction[axis] < 0.0 else 0)
+    return (face * CUBE_CELLS + row) * CUBE_CELLS + column
 
 
 @compiled_in_place
@@ -117,6 +136,20 @@ def triangulate(directions: _Floats) -> Triangulation:
         raise CoverageError("the directions do not surround the head")
     inverses = np.ascontiguousarray(np.linalg.inv(np.swapaxes(corners, 1, 2)))
     return Triangulation(triangles, across, inverses)
+
+
+def triangles_by_cell(directions: _Floats, triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(cell,) a triangle near the middle of each cell of `cube_cell`: a search for a direction that leaves through it
+    is a step or two long from there."""
+    middles = directions[triangles].sum(axis=1)
+    middles /= np.linalg.norm(middles, axis=-1, keepdims=True)
+    near = []
+    across = (2 * np.arange(CUBE_CELLS) + 1) / CUBE_CELLS - 1
+    for axis, sign in product(range(3), (1.0, -1.0)):
+        cells = np.empty((CUBE_CELLS, CUBE_CELLS, 3))
+        cells[..., axis], cells[..., (axis + 1) % 3], cells[..., (axis + 2) % 3] = sign, across[:, None], across
+        near.append(np.argmax(cells.reshape(-1, 3) @ middles.T, axis=-1))
+    return np.concatenate(near)
 
 
 def solid_angles(directions: _Floats) -> _Floats:

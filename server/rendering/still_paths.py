@@ -43,6 +43,7 @@ class StillPaths:
                 triangles=filters.triangulation.triangles,
                 across=filters.triangulation.across,
                 inverses=filters.triangulation.inverses,
+                by_cell=filters.triangles_by_cell,
                 band_cepstra=_band_cepstra(filters.sample_rate, filters.taps),
                 orders=orders.astype(np.float32),
                 reciprocals=(1 / orders).astype(np.float32),

@@ -16,7 +16,7 @@ from server.kernels.compiled import compiled
 from server.kernels.copying import copy
 from server.rendering.fractional_delay import BEFORE, PHASES, TAPS
 from server.rendering.harmonics_kernel import write_harmonics
-from server.rendering.sphere import find_triangle
+from server.rendering.sphere import cube_cell, find_triangle
 
 FloatArray = npt.NDArray[np.float32]
 DoubleArray = npt.NDArray[np.float64]
@@ -33,6 +33,7 @@ class StillPathTables(NamedTuple):
     triangles: IntArray
     across: IntArray
     inverses: DoubleArray
+    by_cell: IntArray  # as `server.rendering.sphere.triangles_by_cell`
     band_cepstra: FloatArray  # (filter band, n) for a gain of one decibel
     orders: FloatArray  # (n,) 1, 1, 2, 3 ...
     reciprocals: FloatArray  # (n,) of `orders`
@@ -62,39 +63,40 @@ def add_still_paths(
     cepstrum, sums = np.zeros((2, count + 8), np.float32), np.zeros((2, count + 8), np.float32)
     taps, padded = np.zeros((2, count), np.float32), np.zeros(wide + TAPS - 1, np.float32)
     still_taps, heard = np.zeros(TAPS, np.float32), np.zeros(wide, np.float32)
-    direction, weights = np.zeros(3), np.zeros(3)
+    directions, weights = np.zeros((lengths_m.size, 3)), np.zeros((lengths_m.size, 3))
+    nearest = np.zeros((lengths_m.size, 3), np.int64)
     of_each = out.shape[0] // ears
     harmonics = np.ones(of_each)
-    triangle = 0
+    for path in range(lengths_m.size):
+        for axis in range(3):
+            for world in range(3):
+                directions[path, axis] += to_head[axis, world] * arrivals[path, world]
+        if ears == 2:
+            _find_corners(tables, directions[path], weights[path], nearest[path])
     for path in range(lengths_m.size):
         length = lengths_m[path]
-        for axis in range(3):
-            direction[axis] = 0.0
-            for world in range(3):
-                direction[axis] += to_head[axis, world] * arrivals[path, world]
-        if ears == 2:
-            triangle = find_triangle(tables.across, tables.inverses, direction, triangle, weights)
+        shared = cepstrum[0, :count]
+        shared[:] = 0
+        for band in range(bands):
+            level_db = gains_db[path, min(band, gains_db.shape[1] - 1)] - tables.air_db_per_m[band] * length
+            loops.add_scaled(tables.band_cepstra[band], level_db, shared)
+        copy(shared, cepstrum[1])
         for ear in range(ears):
             of_ear = cepstrum[ear, :count]
-            of_ear[:] = 0
             if ears == 2:
                 for corner in range(3):
-                    measured = tables.triangles[triangle, corner]
-                    loops.add_scaled(tables.cepstra[measured, ear], weights[corner], of_ear)
-            for band in range(bands):
-                level_db = gains_db[path, min(band, gains_db.shape[1] - 1)] - tables.air_db_per_m[band] * length
-                loops.add_scaled(tables.band_cepstra[band], level_db, of_ear)
+                    loops.add_scaled(tables.cepstra[nearest[path, corner], ear], weights[path, corner], of_ear)
             for n in range(count):
                 of_ear[n] *= tables.orders[n]
         loops.series_exponential(cepstrum, tables.reciprocals, sums, taps)
         if ears == 1:
-            write_harmonics(direction, harmonics)
+            write_harmonics(directions[path], harmonics)
         gain = 1.0 / max(length, tables.nearest_m)
         for ear in range(ears):
             delay_s = length / tables.speed_of_sound
             if ears == 2:
                 for corner in range(3):
-                    delay_s += weights[corner] * tables.head_delays_s[tables.triangles[triangle, corner], ear]
+                    delay_s += weights[path, corner] * tables.head_delays_s[nearest[path, corner], ear]
             delay = delay_s * tables.sample_rate
             whole = int(np.ceil(delay))
             phase = (whole - delay) * PHASES
@@ -108,3 +110,16 @@ def add_still_paths(
                 scale = np.float32(gain * harmonics[number])
                 for i in range(max(0, -begin), min(count + TAPS - 1, out.shape[1] - begin)):
                     out[ear * of_each + number, begin + i] += scale * heard[i]
+
+
+@compiled
+def _find_corners(tables: StillPathTables, direction: DoubleArray, weights: DoubleArray, corners: IntArray) -> None:
+    """Find the measured directions `corners` (3,) around a direction, and their `weights` (3,). What is measured there
+    is fetched from memory while others are sought: a turned head hears from where it did not before."""
+    start = tables.by_cell[cube_cell(direction)]
+    triangle = find_triangle(tables.across, tables.inverses, direction, start, weights)
+    for corner in range(3):
+        measured = tables.triangles[triangle, corner]
+        corners[corner] = measured
+        for ear in range(2):
+            loops.fetch(tables.cepstra[measured, ear], 0, tables.cepstra.shape[2])

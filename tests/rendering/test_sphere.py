@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
-from server.rendering.sphere import CoverageError, fill_gaps, find_triangle, solid_angles, triangulate
+from server.rendering.sphere import (
+    CUBE_CELLS,
+    CoverageError,
+    cube_cell,
+    fill_gaps,
+    find_triangle,
+    solid_angles,
+    triangles_by_cell,
+    triangulate,
+)
 
 
 def random_directions(count, seed=0):
@@ -28,6 +38,43 @@ def test_weights_lead_back_to_the_direction(directions, start):
         assert weights.sum() == pytest.approx(1)
         back = weights @ corners[found]
         np.testing.assert_allclose(back / np.linalg.norm(back), direction, atol=1e-7)
+
+
+def test_directions_leave_a_cube_through_the_cell_whose_middle_is_nearest():
+    steps = (2 * np.arange(CUBE_CELLS) + 1) / CUBE_CELLS - 1
+    one, other = (each.ravel() for each in np.meshgrid(steps, steps, indexing="ij"))
+    faces = [
+        np.roll(np.stack([np.full_like(one, sign), one, other]), axis, axis=0).T
+        for axis in range(3)
+        for sign in (1, -1)
+    ]
+    middles = np.concatenate(faces)
+    for middle in middles:
+        assert_array_equal(middles[cube_cell(middle)], middle)
+    for direction in random_directions(500, seed=2):
+        on_cube = direction / np.abs(direction).max()
+        assert np.abs(middles[cube_cell(direction)] - on_cube).max() <= 1 / CUBE_CELLS + 1e-9
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (1.0, 1.0, -1.0), (0.0, -1.0, 1.0), (0.0, np.nan, 1.0)])
+def test_every_direction_leaves_a_cube_somewhere(direction):
+    assert 0 <= cube_cell(np.array(direction)) < 6 * CUBE_CELLS**2
+
+
+def test_from_the_triangle_of_its_cell_a_direction_is_near(kemar):
+    """Of the triangles that a search tries, all but the last do not hold the direction."""
+    directions = fill_gaps(kemar.directions)[0]
+    mesh = triangulate(directions)
+    by_cell = triangles_by_cell(directions, mesh.triangles)
+    weights = np.zeros(3)
+    tried = []
+    for direction in random_directions(300, seed=3):
+        triangle, steps = by_cell[cube_cell(direction)], 0
+        while (mesh.inverses[triangle] @ direction).min() < -1e-9:
+            triangle, steps = mesh.across[triangle, np.argmin(mesh.inverses[triangle] @ direction)], steps + 1
+        assert find_triangle(mesh.across, mesh.inverses, direction, by_cell[cube_cell(direction)], weights) == triangle
+        tried.append(steps)
+    assert np.mean(tried) < 3
 
 
 def test_at_a_measured_direction_nothing_else_counts(directions):
