@@ -1,6 +1,6 @@
 # Nafir's server: no torch, no training side. Runs as a numeric user on a read-only file system:
 #   docker build -t nafir . && docker run --read-only -p 8000:8000 nafir
-ARG BASE=python:3.11-slim
+ARG BASE=python:3.13-slim
 
 # The library of LLVM that compiles the kernels, for the processor of this machine alone: the one in llvmlite's package can
 # compile for some twenty kinds, and is three and a half times as large. Sources are those of the lock file, LLVM is Debian's.

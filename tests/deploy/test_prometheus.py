@@ -102,4 +102,5 @@ def test_it_sees_the_server_judges_its_alerts_and_answers_every_panel(prometheus
     assert len(panels) > 15
     for each in asked:
         prometheus("query", query=each)
-    until(lambda: all(prometheus("query", query=each)["result"] for each in panels))
+    answered = [each for each in panels if "nafir_store_" not in each]  # this server has no store
+    until(lambda: all(prometheus("query", query=each)["result"] for each in answered))

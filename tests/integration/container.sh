@@ -100,6 +100,8 @@ buildah "${store[@]}" bud --isolation chroot --format docker --pull-never --laye
     --build-arg "BASE=$base" --tag "$image" "$context"
 echo "built in $((SECONDS - started)) s"
 run_podman images --filter "reference=$image"
+bytes=$(run_podman image inspect "$image" --format '{{.Size}}')
+((bytes <= 350000000)) || fail "the image has $((bytes / 1000000)) MB, more than 350"
 
 say "looking into it"
 run_podman image inspect "$image" --format 'user {{.User}}, exposes {{.Config.ExposedPorts}}, command {{.Config.Entrypoint}} {{.Config.Cmd}}'
@@ -255,7 +257,7 @@ else
     rm -rf "$deploy"
     cp --recursive "$root/deploy" "$deploy"
     mkdir -p "$secrets/keys"
-    printf 'IMAGE=localhost/%s\nDOMAIN=localhost\n' "$image" >"$deploy/.env"
+    printf 'IMAGE=localhost/%s\nDOMAIN=localhost\nRESUME_SECRET=%s\n' "$image" "$(head -c 18 /dev/urandom | base64)" >"$deploy/.env"
     nafir_keys() { run_podman run --rm --no-healthcheck --network none "${ulimits[@]}" --volume "$secrets/keys:/keys" --user 0 "$image" keys "$@"; }
     nafir_keys create --file /keys/keys.json --scope metrics >"$secrets/metrics-key"
     echo container-test >"$secrets/grafana-password"
