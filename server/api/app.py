@@ -25,6 +25,7 @@ from server.api.connection import MeasuredScene, StreamHost
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
 from server.api.first_start import CompilingProcess, tell_while_compiling
+from server.api.http_durations import HttpDurations
 from server.api.openapi import install_openapi
 from server.api.page_files import PageFiles
 from server.api.problems import install_problems
@@ -111,7 +112,7 @@ def create_app(
     store = None if settings.bundle_url is None else BundleStore(settings.bundle_url)
     clips = None if settings.clips_url is None else Store(settings.clips_url, "clips_url")
     access = Access.of(settings, own_key=None if peers is None else peers.key)
-    refused = RefusedRequests()
+    refused, durations = RefusedRequests(), HttpDurations()
     if access is None and not settings.is_loopback and (peers is None or peers.number == 0):
         _logger.warning(_OPEN_TO_ALL, settings.host)
 
@@ -161,6 +162,7 @@ def create_app(
                 peers=peers,
                 access=access,
                 refused_requests=refused,
+                http_durations=durations,
                 stores={name: each.calls for name, each in (("bundles", store), ("clips", clips)) if each is not None},
             )
             if settings.realtime:
@@ -209,7 +211,7 @@ def create_app(
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
     app.add_middleware(RateGate, limits=rate_limits, actor=address_of)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outside the others: gives refusals CORS headers
-    app.add_middleware(RequestLog, refused=refused)
+    app.add_middleware(RequestLog, routes=app.router.routes, refused=refused, durations=durations)
     if settings.page:
         app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
     return app

@@ -38,6 +38,7 @@ from server.api.access import Access, Caller, Ending
 from server.api.access_gate import caller_of
 from server.api.block_encoding import CHANNEL_SHARE, BlockEncoding
 from server.api.catalogue import describe_scene
+from server.api.http_durations import HttpDurations
 from server.api.inflow import LISTENER_COST, Allowance
 from server.api.kept_streams import KeptStream, KeptStreams
 from server.api.problems import problem
@@ -294,6 +295,8 @@ class StreamHost:
     """Calls of the stores of bundles and of clips, of those that there are."""
     refused_requests: RefusedRequests = dataclasses.field(default_factory=RefusedRequests)
     """Counts of requests that were refused because of who asked."""
+    http_durations: HttpDurations = dataclasses.field(default_factory=HttpDurations)
+    """How long answers to requests took."""
     ledger: StreamLedger = dataclasses.field(default_factory=StreamLedger)
     """Counts of all streams, open and ended."""
     admission: Admission = dataclasses.field(init=False)

@@ -1,5 +1,5 @@
-"""A line in the log for each request and each refused handshake, an id by which it is found again, and counts of those
-that were refused.
+"""A line in the log for each request and each refused handshake, an id by which it is found again, counts of those
+that were refused, and how long answers took.
 
 The id is that of the request's `X-Request-ID` if it is a plain word, and random otherwise. The answer has it, and so
 has every line that is written on the way, that of a stream included.
@@ -11,12 +11,15 @@ import re
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.declared_routes import RouteTable
+from server.api.http_durations import HttpDurations
 from server.api.problem_codes import PROBLEM_CODES
 from server.runtime.logs import begin_about
 from server.runtime.traces import span
@@ -59,13 +62,22 @@ class RefusedRequests:
 
 
 class RequestLog:
-    """ASGI middleware, the outermost."""
+    """ASGI middleware, the outermost, over the application with these `routes`, which may be added until the first
+    request."""
 
     def __init__(
-        self, app: ASGIApp, *, refused: RefusedRequests, time_s: Callable[[], float] = time.perf_counter
+        self,
+        app: ASGIApp,
+        *,
+        routes: Sequence[BaseRoute],
+        refused: RefusedRequests,
+        durations: HttpDurations,
+        time_s: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._app = app
+        self._routes = RouteTable(routes)
         self._refused = refused
+        self._durations = durations
         self._time_s = time_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -96,13 +108,13 @@ class RequestLog:
             await send(message)
 
         method = scope.get("method", "WEBSOCKET")
+        route = self._routes.template(scope)
         noted = {"http.request.method": method, "nafir.request_id": identifier}
         try:
             with span(method, noted, headers=headers) as traced:
                 try:
                     await self._app(scope, receive, send_noted)
                 finally:
-                    route = getattr(scope.get("route"), "path", None)  # with the names of parameters, not their values
                     if route is not None:
                         traced.update_name(f"{method} {route}")
                         traced.set_attribute("http.route", route)
@@ -112,8 +124,13 @@ class RequestLog:
             status, code = status or 500, code or "internal_error"
             raise
         finally:
+            duration_s = self._time_s() - started_s
             if status is not None:
                 self._refused.note(status, code)
+            if status != 101:  # the handshake of a stream ends when the stream does
+                self._durations.note(
+                    scope.get("method", "GET"), route, _CLIENT_CLOSED_REQUEST if status is None else status, duration_s
+                )
             if status != 101 and not (scope["path"] in _QUIET and status in {200, 204}):
                 _logger.info(
                     "request",
@@ -122,7 +139,7 @@ class RequestLog:
                         "path": _shown(scope["path"]),  # without the query, in which people put keys
                         "status": _CLIENT_CLOSED_REQUEST if status is None else status,
                         **({} if code is None else {"code": code}),
-                        "duration_ms": round(1000 * (self._time_s() - started_s), 1),
+                        "duration_ms": round(1000 * duration_s, 1),
                         "client": scope["client"][0] if scope.get("client") else None,
                     },
                 )

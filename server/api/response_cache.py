@@ -26,6 +26,8 @@ from server.runtime.thread_pool import ThreadPool
 
 Kind = Literal["single", "batch", "map"]
 """Computations that take milliseconds, parts of a longer answer that do, and those that take seconds."""
+Lookup = Literal["hit", "shared", "miss"]
+"""A body is in the cache, is being computed for another request, or has to be computed."""
 Compute = Callable[[Checkpoint], bytes]
 
 _MAX_BYTES = 32 * 1024 * 1024
@@ -96,6 +98,8 @@ class ResponseCache:
         self._turn = 0
         self._takes_s: dict[str, float] = dict(_FIRST_GUESS_S)
         """Smoothed duration of recent computations, by kind."""
+        self.lookups: Counter[Lookup] = Counter(dict.fromkeys(get_args(Lookup), 0))
+        """How often a body was asked for, by how it was found."""
 
     def __enter__(self) -> Self:
         return self
@@ -112,6 +116,11 @@ class ResponseCache:
         return len(self._waiting)
 
     @property
+    def kept_bytes(self) -> int:
+        """Total size of the bodies in the cache."""
+        return self._bodies.bytes
+
+    @property
     def retry_after_s(self) -> int:
         """Whole seconds until there is room again, estimated from the computations that run and wait."""
         pending_s = sum(self._takes_s[each.kind] for each in (*self._waiting, *self._running))
@@ -122,8 +131,10 @@ class ResponseCache:
         goes on only if other requests wait for it. Raises RequestError server_busy if too many computations wait, and
         what `compute` raises."""
         if (kept := self._bodies.get(etag)) is not None:
+            self.lookups["hit"] += 1
             return kept
         computation = self._by_tag.get(etag)
+        self.lookups["miss" if computation is None else "shared"] += 1
         if computation is None:
             computation = self._admit(_Computation(etag, compute, kind, client))
         return await self._result(computation)

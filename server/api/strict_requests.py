@@ -5,46 +5,17 @@ parameter that the route does not have, or that is given twice although it is no
 ignored.
 """
 
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, get_args, get_origin
+from collections.abc import Callable, Sequence
 from urllib.parse import parse_qsl
 
-from fastapi.routing import iter_route_contexts
 from starlette.responses import Response
-from starlette.routing import BaseRoute, Mount
+from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.declared_routes import DeclaredRoute, RouteTable
 from server.api.problems import problem
 from server.core.near_names import suggestion
-
-
-@dataclass(frozen=True)
-class DeclaredRoute:
-    """Declaration of a route. `parameters` maps each query parameter to whether it is repeatable. A route without
-    `methods` is a WebSocket."""
-
-    path: re.Pattern[str]
-    methods: frozenset[str]
-    parameters: dict[str, bool]
-
-
-def declared_routes(routes: Sequence[BaseRoute]) -> Iterator[DeclaredRoute]:
-    """All routes with a path of their own. Mounted applications do their own checks."""
-    for context in iter_route_contexts(routes):
-        if isinstance(context.original_route, Mount):
-            continue
-        dependant = getattr(context, "dependant", None) if context.methods else None
-        fields = [] if dependant is None else dependant.query_params
-        parameters = {field.alias: _is_list(field.field_info.annotation) for field in fields}
-        yield DeclaredRoute(context.path_regex, frozenset(context.methods or ()), parameters)
-
-
-def _is_list(annotation: Any) -> bool:
-    return get_origin(annotation) is list or any(get_origin(each) is list for each in get_args(annotation))
 
 
 class StrictRequests:
@@ -58,19 +29,14 @@ class StrictRequests:
         self, app: ASGIApp, *, routes: Sequence[BaseRoute], closed: Callable[[Scope], Response | None] = lambda _: None
     ) -> None:
         self._app = app
-        self._routes = routes
+        self._routes = RouteTable(routes)
         self._closed = closed
-
-    @cached_property
-    def _declared(self) -> tuple[DeclaredRoute, ...]:
-        return tuple(declared_routes(self._routes))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        path = scope["path"].removeprefix(scope.get("root_path", ""))
-        found = [route for route in self._declared if route.path.match(path)]
+        found = self._routes.find(scope)
         if not found:
             await self._app(scope, receive, send)
             return

@@ -1,7 +1,7 @@
 """Counters and durations of a running server, in Prometheus' text format.
 
-Nothing is counted for this purpose alone. The figures are read on request from those that streams keep for their
-clients.
+Of streams nothing is counted for this purpose alone: the figures are read on request from those that streams keep for
+their clients.
 """
 
 import platform
@@ -15,8 +15,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
 from server.api.request_log import RefusedRequests
+from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger, StreamTotals
 from server.assets.clips import ClipLibrary
 from server.core.durations import DurationHistogram
@@ -61,6 +63,12 @@ class Host(Protocol):
     def refused_requests(self) -> RefusedRequests: ...
 
     @property
+    def http_durations(self) -> HttpDurations: ...
+
+    @property
+    def responses(self) -> ResponseCache: ...
+
+    @property
     def ledger(self) -> StreamLedger: ...
 
     @property
@@ -90,6 +98,11 @@ class ServerCollector(Collector):
         is_draining = readiness.drain.has_begun
         yield GaugeMetricFamily("nafir_draining", "1 if the server is shutting down.", value=is_draining)
         yield from _threads(readiness.watch)
+        yield _histogram(
+            "nafir_event_loop_lag_seconds",
+            "How much later than it was due the event loop came to a timer, ten times a second.",
+            readiness.watch.lag,
+        )
         yield from self._streams(streams)
         yield from self._blocks(totals)
         yield from _regrets(totals.regrets)
@@ -111,6 +124,8 @@ class ServerCollector(Collector):
         yield self._level_costs()
         yield from _admission(self._host.admission)
         yield _refused(self._host.refused_requests)
+        yield _http(self._host.http_durations)
+        yield from _cache(self._host.responses)
         yield from _kept(self._host.kept)
         clips = {name for library in self._host.clips.values() for name in library.names}
         yield GaugeMetricFamily("nafir_clips", "Clips that emitters can play.", value=len(clips))
@@ -264,6 +279,33 @@ def _refused(refused: RefusedRequests) -> Metric:
     for (status, reason), count in tuple(refused.counts.items()):
         counted.add_metric([status, reason], count)
     return counted
+
+
+def _http(durations: HttpDurations) -> Metric:
+    times = HistogramMetricFamily(
+        "nafir_http_request_duration_seconds",
+        "Time from a request until its answer was sent, by the path with names of parameters (`other` for files of the "
+        "page and unknown paths) and the first digit of the status. Streams count only if they are refused.",
+        labels=["method", "route", "status"],
+    )
+    for labels, buckets, total_s in durations.told():
+        times.add_metric(labels, buckets, total_s)
+    return times
+
+
+def _cache(responses: ResponseCache) -> Iterator[Metric]:
+    lookups = CounterMetricFamily(
+        "nafir_response_cache_lookups",
+        "Requests for a body that takes time to compute, by whether it was in the cache (hit), was being computed for "
+        "another request (shared), or had to be computed (miss). What a client has itself is not asked for (304).",
+        labels=["result"],
+    )
+    for result, count in responses.lookups.items():
+        lookups.add_metric([result], count)
+    yield lookups
+    yield GaugeMetricFamily(
+        "nafir_response_cache_bytes", "Size of the bodies in the cache.", value=responses.kept_bytes
+    )
 
 
 def _kept(streams: KeptStreams) -> Iterator[Metric]:

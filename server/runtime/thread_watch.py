@@ -3,6 +3,8 @@
 A thread is *stuck* while one piece of work takes longer than such work ever should. Python cannot end a thread, so the
 server is not ready until the stuck thread goes on. Time is counted in looks at the threads, not in seconds, so that no
 thread counts as stuck after the machine was suspended.
+
+The event loop looks at the threads, so the watch also tells how late that comes to its work.
 """
 
 import asyncio
@@ -11,6 +13,8 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Literal, Protocol
+
+from server.core.durations import DurationHistogram
 
 PERIOD_S = 0.1
 _GIVE_UP_AFTER = 3
@@ -69,6 +73,8 @@ class ThreadWatch:
         """How often each thread, by name, was replaced."""
         self.stuck: tuple[str, ...] = ()
         """Names of the threads that are stuck now."""
+        self.lag = DurationHistogram()
+        """How much later than it was due the event loop came to each look."""
         self._has_failed = False
 
     @property
@@ -112,9 +118,12 @@ class ThreadWatch:
 
     async def run(self) -> None:
         """Check the threads again and again until cancelled."""
+        time_s = asyncio.get_running_loop().time
         try:
             while True:
+                due_s = time_s() + PERIOD_S
                 await asyncio.sleep(PERIOD_S)
+                self.lag.add(max(0.0, time_s() - due_s))
                 self.look()
         except Exception:  # an unwatched server must not seem a healthy one
             self._has_failed = True

@@ -8,6 +8,7 @@ from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
 from server.api import request_log
+from server.api.http_durations import HttpDurations
 from server.api.problems import problem
 from server.api.request_log import REQUEST_ID, RefusedRequests, RequestLog
 
@@ -18,7 +19,12 @@ def counted():
 
 
 @pytest.fixture
-def client(counted):
+def durations():
+    return HttpDurations()
+
+
+@pytest.fixture
+def client(counted, durations):
     async def good(_):
         return PlainTextResponse("heard")
 
@@ -50,10 +56,12 @@ def client(counted):
         Route("/streams/process", silent, methods=["PUT"]),
         Route("/v1/refused", refused),
         Route("/v1/failing", failing),
+        Route("/v1/rooms/{room}", good),
         Route("/v1/bare", bare),
         WebSocketRoute("/v1/stream", stream),
     ]
-    return TestClient(RequestLog(Starlette(routes=routes), refused=counted), raise_server_exceptions=False)
+    app = RequestLog(Starlette(routes=routes), routes=routes, refused=counted, durations=durations)
+    return TestClient(app, raise_server_exceptions=False)
 
 
 @pytest.fixture
@@ -129,6 +137,34 @@ def test_who_is_refused_is_counted_once(client, counted):
             pass
     told = {refusal: count for refusal, count in counted.counts.items() if count}
     assert told == {("401", "key_required"): 1, ("403", "origin_not_allowed"): 1}
+
+
+def timed(durations):
+    """How many answers were timed, by method, route and status."""
+    return {labels: buckets[-1][1] for labels, buckets, _ in durations.told()}
+
+
+def test_answers_are_timed_by_the_route_and_not_by_what_a_client_writes_there(client, durations):
+    for room in range(5):
+        client.get(f"/v1/rooms/{room}?key=secret")
+        client.get(f"/nowhere/{room}")
+    client.post("/v1/rooms/a")
+    client.get("/v1/failing")
+    assert timed(durations) == {
+        ("GET", "/v1/rooms/{room}", "2xx"): 5,
+        ("GET", "other", "4xx"): 5,
+        ("POST", "/v1/rooms/{room}", "4xx"): 1,
+        ("GET", "/v1/failing", "5xx"): 1,
+    }
+
+
+def test_a_stream_that_was_opened_is_not_timed_and_a_refused_one_is(client, durations):
+    with client.websocket_connect("/v1/stream"):
+        pass
+    assert timed(durations) == {}
+    with pytest.raises(WebSocketDenialResponse), client.websocket_connect("/v1/stream?deny"):
+        pass
+    assert timed(durations) == {("GET", "/v1/stream", "4xx"): 1}
 
 
 def test_an_id_is_taken_over_if_it_is_a_plain_word(client):

@@ -69,10 +69,14 @@ def test_equal_requests_are_one_computation_and_the_body_is_kept(work):
         await until(lambda: work.begun)
         work.release()
         bodies = await asyncio.gather(*asked)
-        return [*bodies, await ask(cache, work, "x")]
+        again = await ask(cache, work, "x")
+        return [*bodies, again], cache.lookups, cache.kept_bytes
 
-    assert scenario(run) == [b"x"] * 11
+    bodies, lookups, kept_bytes = scenario(run)
+    assert bodies == [b"x"] * 11
     assert work.begun == ["x"]
+    assert lookups == {"miss": 1, "shared": 9, "hit": 1}
+    assert kept_bytes == 1
 
 
 def test_what_nobody_waits_for_is_called_off_with_the_last_who_leaves(work):

@@ -747,3 +747,16 @@ def test_effects_whose_cost_cannot_be_measured_leave_the_server_ready_and_the_lo
             assert time.monotonic() - began_s < 10
             time.sleep(0.02)
         assert client.get("/readyz").status_code == 200
+
+
+def test_answers_are_timed_by_route_and_lookups_of_the_cache_are_counted(shared_client):
+    labels = '{method="GET",route="/v1/scenes/{scene}/impulse-response",status="2xx"}'
+    timed = f"nafir_http_request_duration_seconds_count{labels}"
+    looked_up = 'nafir_response_cache_lookups_total{result="%s"}'
+    query = {"listener": "2.03,2.01,1.5", "emitter": "6.07,3.02,1.5"}
+    assert shared_client.get("/v1/scenes/flat/impulse-response", params=query).status_code == 200
+    before = [metric(shared_client, name) for name in (timed, looked_up % "miss", looked_up % "hit")]
+    for _ in range(2):
+        assert shared_client.get("/v1/scenes/flat/impulse-response", params=query | {"yaw_deg": "7.25"}).is_success
+    after = [metric(shared_client, name) for name in (timed, looked_up % "miss", looked_up % "hit")]
+    assert [now - then for now, then in zip(after, before, strict=True)] == [2, 1, 1]

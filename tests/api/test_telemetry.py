@@ -5,8 +5,11 @@ import pytest
 from prometheus_client import ProcessCollector
 from prometheus_client.parser import text_string_to_metric_families
 
+from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
+from server.api.process_peers import merged
 from server.api.request_log import RefusedRequests
+from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector, exposition
 from server.core.durations import DurationHistogram
@@ -32,8 +35,9 @@ class Clips:
 
 
 class Host:
-    def __init__(self, audio, offers):
+    def __init__(self, audio, offers, responses):
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
+        self.responses, self.http_durations = responses, HttpDurations()
         self.refused_bundles = 0
         self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
@@ -46,7 +50,9 @@ class Host:
 @pytest.fixture
 def host(field):
     offer = Offer((field.level,), {"standard": 2.5})
-    return Host(AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0), {"flat": offer})
+    audio = AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0)
+    with ResponseCache(workers=1, waiting=1) as responses:
+        yield Host(audio, {"flat": offer}, responses)
 
 
 def open_stream(host, field, filters):
@@ -183,6 +189,66 @@ def test_refused_callers_are_counted_by_code_and_nothing_else_makes_a_label(host
     assert told.keys() == before.keys()
     counted = {dict(key[1:])["status"] + dict(key[1:])["reason"]: told[key] for key in refused if told[key]}
     assert counted == {"401key_refused": 1, "401other": 1, "429other": 1}
+
+
+def http_times(told, suffix):
+    """By method, route and status."""
+    name = f"nafir_http_request_duration_seconds_{suffix}"
+    found = {
+        tuple(dict(labels)[each] for each in ("method", "route", "status")): labels
+        for first, *labels in told
+        if first == name
+    }
+    return {key: told[(name, *labels)] for key, labels in found.items()}
+
+
+def test_answers_are_timed_by_method_route_and_status_and_clients_make_no_labels(host):
+    clips = "/v1/clips/{clip}"
+    for duration_s in (0.001, 0.3, 0.005, 20.0):
+        host.http_durations.note("GET", clips, 200, duration_s)
+    for method in ("BREW", "PROPFIND", "get"):
+        host.http_durations.note(method, None, 405, 0.001)
+    host.http_durations.note("DELETE", clips, 204, 0.25)
+    told = samples(host)
+    counts = http_times(told, "count")
+    assert counts == {("GET", clips, "2xx"): 4, ("other", "other", "4xx"): 3, ("DELETE", clips, "2xx"): 1}
+    assert http_times(told, "sum")["GET", clips, "2xx"] == pytest.approx(20.306)
+    of_get = {
+        dict(labels)["le"]: value
+        for (name, *labels), value in told.items()
+        if name == "nafir_http_request_duration_seconds_bucket" and ("method", "GET") in labels
+    }
+    assert of_get == {"0.005": 2, "0.025": 2, "0.1": 2, "0.5": 3, "2.5": 3, "10": 3, "+Inf": 4}
+
+
+def test_lookups_of_the_cache_and_the_lag_of_the_event_loop_are_told(host):
+    before = samples(host)
+    results = {("result", result) for result in ("hit", "shared", "miss")}
+    assert {before["nafir_response_cache_lookups_total", each] for each in results} == {0}
+    assert before["nafir_event_loop_lag_seconds_count",] == 0
+    host.responses.lookups["shared"] += 2
+    host.readiness.watch.lag.add(0.02, times=3)
+    told = samples(host)
+    assert told["nafir_response_cache_lookups_total", ("result", "shared")] == 2
+    assert told["nafir_response_cache_bytes",] == 0
+    assert told["nafir_event_loop_lag_seconds_count",] == 3
+    assert told["nafir_event_loop_lag_seconds_sum",] == pytest.approx(0.06)
+
+
+def test_of_several_processes_each_tells_its_own(host):
+    host.http_durations.note("GET", "/livez", 200, 0.001)
+    first = exposition(ServerCollector(host))
+    host.http_durations.note("GET", "/livez", 200, 0.001)
+    host.responses.lookups["hit"] += 1
+    text = merged({0: first, 1: exposition(ServerCollector(host))}).decode()
+    told = {
+        (sample.name, sample.labels["process"], sample.labels.get("route") or sample.labels.get("result")): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+    assert [told["nafir_http_request_duration_seconds_count", each, "/livez"] for each in "01"] == [1, 2]
+    assert [told["nafir_response_cache_lookups_total", each, "hit"] for each in "01"] == [0, 1]
+    assert [told["nafir_event_loop_lag_seconds_count", each, None] for each in "01"] == [0, 0]
 
 
 def test_calls_of_stores_are_told_by_what_was_asked_and_how_it_failed(host):

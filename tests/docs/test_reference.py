@@ -11,9 +11,11 @@ import pytest
 import typer
 
 from server.api.app import create_app
+from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
 from server.api.problem_codes import PROBLEM_CODES
 from server.api.request_log import RefusedRequests
+from server.api.response_cache import ResponseCache
 from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector
@@ -136,7 +138,7 @@ def test_every_meaning_is_of_a_code_in_the_source() -> None:
 
 
 class Host:
-    def __init__(self) -> None:
+    def __init__(self, responses: ResponseCache) -> None:
         self.audio = AudioEngine(lambda call: call(), Patient(), time_s=lambda: 50.0)
         self.ledger = StreamLedger()
         self.admission = Admission(self.audio, most_streams=1, cores=2)
@@ -147,10 +149,13 @@ class Host:
         self.refused_bundles = 0
         self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
+        self.http_durations = HttpDurations()
+        self.responses = responses
 
 
 def test_every_metric_is_listed(page: Page) -> None:
-    told = {family.name for family in ServerCollector(Host()).collect()}
+    with ResponseCache(workers=1, waiting=1) as responses:
+        told = {family.name for family in ServerCollector(Host(responses)).collect()}
     listed = {re.sub(r"_(total|info)$", "", word) for word in words(page("reference/metrics"))}
     assert len(told) > 15
     assert told <= listed

@@ -1,6 +1,9 @@
 """A dead thread is replaced and a stuck one told of, by a watch whose looks a test makes."""
 
+import asyncio
+import contextlib
 import math
+import time
 
 import pytest
 
@@ -91,8 +94,6 @@ def test_threads_that_die_again_and_again_are_a_problem_until_they_live_for_a_mi
 
 
 def test_a_watch_that_fails_is_a_problem_itself(monkeypatch, group, caplog):
-    import asyncio
-
     from server.runtime import thread_watch
 
     monkeypatch.setattr(thread_watch, "PERIOD_S", 0.0)
@@ -102,3 +103,20 @@ def test_a_watch_that_fails_is_a_problem_itself(monkeypatch, group, caplog):
     asyncio.run(watch.run())
     assert "watch" in watch.problem
     assert "has failed" in caplog.text
+
+
+def test_what_holds_up_the_event_loop_is_lag(watch):
+    held_s = 3 * PERIOD_S
+
+    async def hold_up():
+        watching = asyncio.create_task(watch.run())
+        await asyncio.sleep(0)  # the watch begins to wait
+        time.sleep(held_s)  # noqa: ASYNC251  what must not be done
+        while not watch.lag.count:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        watching.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await watching
+
+    asyncio.run(hold_up())
+    assert watch.lag.total_s >= held_s - PERIOD_S - 0.001
