@@ -1,6 +1,7 @@
 import math
 
 import pytest
+import uvicorn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.applications import Starlette
@@ -12,6 +13,7 @@ from starlette.testclient import TestClient, WebSocketDenialResponse
 from server.api.api_keys import create_key
 from server.api.app import create_app
 from server.api.rate_limits import Buckets, Rate, RateGate, RateLimits, address_of
+from server.api.serving import uvicorn_options
 from server.api.settings import Settings
 
 
@@ -188,3 +190,42 @@ def test_a_server_limits_addresses_before_it_looks_at_keys_and_each_key_on_any_a
     good = {"Authorization": f"Bearer {other}"}
     assert statuses("127.0.0.1", good, 2) == [405, 405]
     assert statuses("203.0.113.3", good, 2) == [405, 429]
+
+
+@pytest.fixture
+def behind_proxy(monkeypatch):
+    """The address that a request counts for, by the address that it comes from and those that it names as forwarded,
+    as `nafir serve` runs the application and trusts 10.213.7.0/28."""
+    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "10.213.7.0/28")
+
+    async def tell(request):
+        return PlainTextResponse(str(address_of(request.scope)))
+
+    config = uvicorn.Config(Starlette(routes=[Route("/", tell)]), **uvicorn_options(Settings()))
+    config.load()
+
+    def ask(peer, *forwarded):
+        headers = [("X-Forwarded-For", each) for each in forwarded]
+        return TestClient(config.loaded_app, client=(peer, 50_000)).get("/", headers=headers).text
+
+    return ask
+
+
+@pytest.mark.parametrize(
+    ("peer", "forwarded", "actor"),
+    [
+        ("10.213.7.2", ["203.0.113.7"], "address 203.0.113.7"),
+        ("10.213.7.2", ["203.0.113.8"], "address 203.0.113.8"),
+        ("10.213.7.2", ["2001:db8:1:2::7"], "address 2001:db8:1:2::/64"),
+        ("10.213.7.2", [], "address 10.213.7.2"),
+        # What a client has written comes before what its proxy has added, in one header or in two.
+        ("10.213.7.2", ["127.0.0.1, 203.0.113.7"], "address 203.0.113.7"),
+        ("10.213.7.2", ["127.0.0.1", "203.0.113.7"], "address 203.0.113.7"),
+        ("10.213.7.2", ["203.0.113.7, 10.213.7.3"], "address 203.0.113.7"),
+        # Nobody else is believed, on a network beside it either.
+        ("203.0.113.9", ["203.0.113.7"], "address 203.0.113.9"),
+        ("10.213.7.16", ["127.0.0.1"], "address 10.213.7.16"),
+    ],
+)
+def test_a_trusted_proxy_tells_whose_request_it_is_and_nobody_else_does(behind_proxy, peer, forwarded, actor):
+    assert behind_proxy(peer, *forwarded) == actor

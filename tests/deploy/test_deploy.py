@@ -1,6 +1,7 @@
 """What `deploy/` names exists: settings with their values, metrics, times that fit together. Where the programs that
 read these files are installed, they read them too."""
 
+import ipaddress
 import json
 import os
 import re
@@ -193,6 +194,24 @@ def test_nobody_is_cut_off_before_the_server_has_drained():
 def test_the_proxy_gives_up_connections_before_the_server_does():
     kept_s = seconds(re.search(r"keepalive (\S+)", (DEPLOY / "Caddyfile").read_text())[1])
     assert kept_s < Settings.model_fields["keep_alive_s"].default
+
+
+def test_only_the_proxy_may_say_whose_requests_it_passes_on():
+    trusted = of_compose()["FORWARDED_ALLOW_IPS"]
+    names = {
+        name
+        for name, network in compose()["networks"].items()
+        for each in network.get("ipam", {}).get("config", ())
+        if filled_in(each["subnet"]) == trusted
+    }
+    assert len(names) == 1
+    inside = {name for name, service in compose()["services"].items() if names & set(service["networks"])}
+    assert inside == {"server", "caddy"}
+    assert {*server_of_compose()["networks"]} & {*compose()["services"]["caddy"]["networks"]} == names
+    for environment in (of_compose(), of_kubernetes()):
+        network = ipaddress.ip_network(environment["FORWARDED_ALLOW_IPS"])  # raises for *, which trusts everybody
+        assert network.is_private
+    assert manifest("NetworkPolicy")["spec"]["policyTypes"] == ["Ingress", "Egress"]
 
 
 def test_containers_run_without_privileges():

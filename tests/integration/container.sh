@@ -59,7 +59,7 @@ unpack='import sys, tarfile; tarfile.open(fileobj=sys.stdin.buffer, mode="r|").e
 tear_down() {
     if [ -n "$composed" ]; then
         run_compose down --volumes || true
-        run_podman network rm --force nafir-test_front nafir-test_inside >/dev/null 2>&1 || true
+        run_podman network rm --force nafir-test_front nafir-test_proxied nafir-test_inside >/dev/null 2>&1 || true
     fi
     run_podman rm --force --ignore "$container" >/dev/null 2>&1 || true
     if [ -z "$keep" ]; then
