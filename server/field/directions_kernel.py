@@ -13,6 +13,7 @@ from server.kernels.compiled import compiled, compiled_loosely
 from server.kernels.simd import (
     WIDE_LANES,
     add,
+    any_above,
     at_least,
     choose_below,
     divide,
@@ -191,23 +192,25 @@ def ears_of_directions(
             real, imaginary = multiply(real, scale), multiply(imaginary, scale)
             square = multiply_add(real, real, multiply(imaginary, imaginary))
             # guard: coherence from directions is at most one
-            shrunk = divide(one, square_root(at_least(square, one)))
+            if any_above(square, one):  # rarely true
+                shrunk = divide(one, square_root(at_least(square, one)))
+                real, imaginary = multiply(real, shrunk), multiply(imaginary, shrunk)
             if margin >= 0:
                 store(levels[0, bin_].ctypes.data, margin + column, left_size)
                 store(levels[1, bin_].ctypes.data, margin + column, right_size)
-                store(coherence[0, bin_].ctypes.data, margin + column, multiply(real, shrunk))
-                store(coherence[1, bin_].ctypes.data, margin + column, multiply(imaginary, shrunk))
+                store(coherence[0, bin_].ctypes.data, margin + column, real)
+                store(coherence[1, bin_].ctypes.data, margin + column, imaginary)
                 continue
             if column + WIDE_LANES <= levels.shape[2]:
                 store(levels[0, bin_].ctypes.data, column, logarithm(add(left_size, floor)))
                 store(levels[1, bin_].ctypes.data, column, logarithm(add(right_size, floor)))
-                store(coherence[0, bin_].ctypes.data, column, multiply(real, shrunk))
-                store(coherence[1, bin_].ctypes.data, column, multiply(imaginary, shrunk))
+                store(coherence[0, bin_].ctypes.data, column, real)
+                store(coherence[1, bin_].ctypes.data, column, imaginary)
                 continue
             store(rest, 0, logarithm(add(left_size, floor)))
             store(rest, row, logarithm(add(right_size, floor)))
-            store(rest, 2 * row, multiply(real, shrunk))
-            store(rest, 3 * row, multiply(imaginary, shrunk))
+            store(rest, 2 * row, real)
+            store(rest, 3 * row, imaginary)
             for lane in range(columns - column):
                 levels[0, bin_, column + lane] = work[harmonics, 0, lane]
                 levels[1, bin_, column + lane] = work[harmonics, 1, lane]

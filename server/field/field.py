@@ -474,15 +474,12 @@ class AcousticField:
         return _Told(self.graph.arrivals(listeners, emitters, paths), times)
 
     def _remembered(self, listeners: Sequence[Vector3], emitters: Sequence[Vector3]) -> _Told:
-        """What poses (B) say, from memory where it is there. Raises ValueError for positions that are not finite."""
+        """What poses (B) say, from memory where it is there."""
         keys = [(self._state, *pair) for pair in zip(listeners, emitters, strict=True)]
         known = [self._told.get(key) for key in keys]
         missing = [row for row, told in enumerate(known) if told is None]
         if missing:
             ears, places = (np.array([ends[row] for row in missing]) for ends in (listeners, emitters))
-            # guard: positions that are not finite say nothing that is remembered
-            if not _are_finite(ears, places):
-                raise ValueError("listeners and emitters must be finite")
             told = self._tell(ears, places)
             for number, row in enumerate(missing):
                 known[row] = one = told.row(number) if len(missing) > 1 else told

@@ -44,18 +44,18 @@ class ArrayPool:
     def take(self, size: int) -> Bytes:
         """An uninitialised array (size,) that begins on a cache line. It returns to the pool by itself when its last
         view is gone."""
-        return _aligned(size) if size < _LARGE_BYTES else np.asarray(self._lent(size, "|u1", (size,)))
+        return (
+            _aligned(size)
+            if size < _LARGE_BYTES
+            else np.asarray(_Lent(self, self._find(size) or _Memory(size), "|u1", (size,)))
+        )
 
     def floats(self, *shape: int) -> npt.NDArray[np.float32]:
         """As `take`, for float32 of any shape."""
         size = math.prod(shape) * _FLOAT_BYTES
         if size < _LARGE_BYTES:
             return _aligned(size).view(np.float32).reshape(shape)
-        return np.asarray(self._lent(size, "<f4", shape))
-
-    def _lent(self, size: int, kind: str, shape: tuple[int, ...]) -> "_Lent":
-        found = self._find(size)
-        return _Lent(self, _Memory(size) if found is None else found, kind, shape)
+        return np.asarray(_Lent(self, self._find(size) or _Memory(size), "<f4", shape))
 
     def _find(self, size: int) -> "_Memory | None":
         if self._lock.acquire(blocking=False):
@@ -90,21 +90,12 @@ class ArrayPool:
 class _Memory:
     """`size` bytes, and how NumPy last saw them: mostly an array is needed again as it was."""
 
-    __slots__ = ("_array", "_interface", "size")
+    __slots__ = ("_array", "interface", "size")
 
     def __init__(self, size: int) -> None:
         self.size = size
         self._array = _aligned(size)
-        self._interface: dict[str, Any] = dict(self._array.__array_interface__)
-
-    def as_array(self, kind: str, shape: tuple[int, ...]) -> dict[str, Any]:
-        """The interface of an array of a `kind` and a `shape` in this memory."""
-        known = self._interface
-        if known["shape"] == shape and known["typestr"] == kind:
-            return known
-        made = {"data": known["data"], "shape": shape, "typestr": kind, "version": 3}
-        self._interface = made
-        return made
+        self.interface: dict[str, Any] = dict(self._array.__array_interface__)
 
 
 class _Lent:
@@ -116,7 +107,11 @@ class _Lent:
         """NumPy sees it as an array of a `kind` and a `shape`, in a third of the time of two views."""
         self._pool = pool
         self._memory = memory
-        self.__array_interface__ = memory.as_array(kind, shape)
+        interface = memory.interface
+        if interface["shape"] != shape or interface["typestr"] != kind:
+            interface = {"data": interface["data"], "shape": shape, "typestr": kind, "version": 3}
+            memory.interface = interface
+        self.__array_interface__ = interface
 
     def __del__(self) -> None:
         self._pool._keep(self._memory)

@@ -65,6 +65,14 @@ class Partitioning:
         if self.ir_samples < 1:
             raise ValueError("ir_samples must be at least 1")
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Plans of many kinds are found by it, several times for each response."""
+        return hash((self.block_size, self.ir_samples, self.any_size))
+
     @cached_property
     def stages(self) -> tuple[Stage, ...]:
         stages: list[Stage] = []

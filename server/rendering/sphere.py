@@ -47,7 +47,7 @@ def cube_cell(direction: _Floats) -> int:
         if abs(direction[other]) > abs(direction[axis]):
             axis = other
     reach = abs(direction[axis])
-    # guard: what is no direction leaves through some cell too
+    # What is no direction leaves through some cell too.
     half = 0.5 * CUBE_CELLS / reach if reach > 0.0 else 0.0
     row = max(0, min(CUBE_CELLS - 1, int(half * direction[(axis + 1) % 3] + 0.5 * CUBE_CELLS)))
     column = max(0, min(CUBE_CELLS - 1, int(half * direction[(axis + 2) % 3] + 0.5 * CUBE_CELLS)))
