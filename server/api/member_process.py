@@ -44,7 +44,8 @@ def _serve(told: dict[str, Any]) -> None:
     configure_logs(settings.log_format, settings.log_level, lines_per_min=settings.log_lines_per_min)
     drain = Drain(settings.drain_s)
     # Not among the arguments, which other users of the machine can see.
-    peers = ProcessPeers(told["number"], tuple(told["ports"]), os.environ.pop(KEY_VARIABLE, None))
+    key = os.environ.pop(KEY_VARIABLE, None)
+    peers = ProcessPeers(told["number"], tuple(told["ports"]), key, told["endings"])
     with (
         socket.socket(fileno=told["channel"]) as channel,
         socket.socket(fileno=told["own"]) as own,

@@ -12,7 +12,7 @@ import hmac
 import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily
@@ -22,6 +22,8 @@ from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 from pydantic import BaseModel
 
+Ending = Literal["died", "hung"]
+"""Why a process was replaced: it ended by itself, or was ended since its event loop did nothing any more."""
 OWN_METRICS = "/metrics/process"
 """Where a process answers with its own metrics only."""
 OWN_STREAMS = "/streams/process"
@@ -83,12 +85,13 @@ def random_token() -> str:
 
 @dataclass(frozen=True)
 class ProcessPeers:
-    """A process of a server: its `number`, at which port of the loopback interface each of them answers, and the `key`
-    that they ask each other with."""
+    """A process of a server: its `number`, at which port of the loopback interface each of them answers, the `key` that
+    they ask each other with, and how often those before it of this number have ended."""
 
     number: int
     ports: tuple[int, ...]
     key: str | None = field(default=None, repr=False)
+    endings: Mapping[Ending, int] = field(default_factory=dict)
 
     async def gather(self, own: bytes) -> dict[int, bytes | None]:
         """The metrics of all processes by number; `own` are those of this one. A process that does not answer within

@@ -11,8 +11,8 @@ loads. A stream stays for long, so chance would leave it on a busy process besid
 Four times a second each process reports whether it is ready and what its streams take. The connection itself passes to
 the process, so nothing of the stream comes by here.
 
-The first process starts alone. What it compiles is on disk when the others start. A process that ends is replaced; if
-that happens again and again, the server ends.
+The first process starts alone. What it compiles is on disk when the others start. A process that ends is replaced, and
+one whose event loop hangs is ended; if that happens again and again, the server ends.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -34,8 +34,9 @@ from itertools import pairwise
 from typing import Any
 
 from server.api.api_keys import random_key
-from server.api.process_peers import KEY_VARIABLE
+from server.api.process_peers import KEY_VARIABLE, Ending
 from server.core.errors import NafirError
+from server.runtime.service_notices import ServiceNotices
 
 COMMAND = sys.executable, "-m", "server.api.member_process"
 """Starts a process; what it is told follows as JSON."""
@@ -44,12 +45,17 @@ USER_ERROR = 2
 REPORT_S = 0.25
 """Seconds between two reports of a process."""
 _STALE_S = 5.0
+HUNG_S = 30.0
+"""Seconds without a report after which a process that has reported before is ended. Its event loop reports, and is
+never held up for more than a fraction of a second, also where the machine has too little for all. Clients have long
+given up by then, and resume elsewhere."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a connection is taken to need until the next report: connections that come together are spread
 over the processes."""
 _MOST_DEATHS = 3
 _DEATHS_WITHIN_S = 60.0
 _LOOK_S = 0.5
+_LONGEST_LOOK_S = 1.0
 _AT_ONCE = 64
 """Connections accepted before anything else has its turn."""
 _GRACE_S = 2.0
@@ -92,7 +98,19 @@ class Member:
     reported_s: float = -math.inf
     handed_s: float = -math.inf
     """When the last connection was handed to it."""
+    silent_s: float = 0.0
+    """How long it has not reported, while this process would have noticed."""
     unread: bytearray = field(default_factory=bytearray)
+
+    @property
+    def is_hung(self) -> bool:
+        return self.silent_s > HUNG_S
+
+    def wait(self, passed_s: float) -> None:
+        """Count time without a report, once there was one: a start may take minutes. Of a longer pause little counts,
+        since then this process was stopped too, as the whole machine may have been."""
+        if self.reported_s > -math.inf:
+            self.silent_s += min(passed_s, _LONGEST_LOOK_S)
 
     def read(self, data: bytes, now_s: float) -> None:
         """Read reports: a line of JSON each."""
@@ -102,7 +120,7 @@ class Member:
         if lines:
             report = json.loads(lines[-1])
             self.is_ready, self.load = report["is_ready"], report["load"]
-            self.handed, self.reported_s = 0, now_s
+            self.handed, self.reported_s, self.silent_s = 0, now_s, 0.0
 
 
 def least_loaded(members: Sequence[Member], now_s: float) -> list[Member]:
@@ -114,7 +132,8 @@ def least_loaded(members: Sequence[Member], now_s: float) -> list[Member]:
 
 class ProcessGroup:
     """Runs a process on each share of the cores and hands them the connections to `listeners`. `options` are those of
-    the command, and `url` is announced once the first process serves. `command` starts a process."""
+    the command, and `url` is announced once the first process serves. `command` starts a process. This process gives
+    the signs of life of `notices`."""
 
     def __init__(
         self,
@@ -125,6 +144,7 @@ class ProcessGroup:
         url: str,
         drain_s: float,
         command: Sequence[str] = COMMAND,
+        notices: ServiceNotices | None = None,
     ) -> None:
         self._listeners = listeners
         self._shares = shares
@@ -132,11 +152,15 @@ class ProcessGroup:
         self._url = url
         self._drain_s = drain_s
         self._command = command
+        self._notices = ServiceNotices() if notices is None else notices
         self._own = [listening_privately() for _ in shares]
         self._key, _ = random_key()
         self._members: dict[int, Member] = {}
         self._selector = selectors.DefaultSelector()
         self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
+        self._endings: dict[int, Counter[Ending]] = {number: Counter() for number in range(len(shares))}
+        """By number, how often a process was replaced, and why."""
+        self._looked_s = time.monotonic()
         self._has_announced = False
         self._exit_code = 0
         self._cut_off_s = math.inf
@@ -184,6 +208,7 @@ class ProcessGroup:
             "ports": [listener.getsockname()[1] for listener in self._own],
             "url": None if self._has_announced else self._url,
             "options": self._options,
+            "endings": self._endings[number],
         }
         self._has_announced = True
         with theirs:
@@ -225,6 +250,7 @@ class ProcessGroup:
             data = b""
         if data:
             member.read(data, time.monotonic())
+            self._notices.ready()
         else:
             self._bury(member)
 
@@ -253,16 +279,27 @@ class ProcessGroup:
             self._stop(1)
             return
         _logger.error("process %d has ended with code %d and is replaced", member.number, exit_code)
+        self._endings[member.number]["hung" if member.is_hung else "died"] += 1
         self._start(member.number)
 
     def _look(self) -> None:
-        """Start the other processes once one is ready. Cut off those that do not end."""
+        """Start the other processes once one is ready. End those that hang, and cut off those that do not end."""
+        now_s = time.monotonic()
+        passed_s, self._looked_s = now_s - self._looked_s, now_s
+        self._notices.beat()
         if self._is_stopping:
-            if time.monotonic() > self._cut_off_s:
+            if now_s > self._cut_off_s:
                 _logger.error("not all processes had ended: cut off")
                 self._exit_code = self._exit_code or 1
                 self._kill()
-        elif len(self._members) < len(self._shares) and any(member.is_ready for member in self._members.values()):
+            return
+        for member in self._members.values():
+            was_hung = member.is_hung
+            member.wait(passed_s)
+            if member.is_hung and not was_hung:
+                _logger.error("process %d has not reported for %g s and is ended", member.number, HUNG_S)
+                member.process.kill()  # then its channel ends
+        if len(self._members) < len(self._shares) and any(member.is_ready for member in self._members.values()):
             for number in range(len(self._shares)):
                 if number not in self._members:
                     self._start(number)
@@ -279,6 +316,7 @@ class ProcessGroup:
 
     def _stop(self, exit_code: int) -> None:
         """Tell all processes to end in order."""
+        self._notices.stopping()
         self._exit_code = exit_code
         self._cut_off_s = time.monotonic() + self._drain_s + _GRACE_S
         for member in self._members.values():

@@ -21,6 +21,7 @@ from server.api.http_protocol import limited_http
 from server.api.process_peers import ProcessPeers
 from server.api.settings import Settings, usable_cores
 from server.runtime.drain import Drain
+from server.runtime.service_notices import ServiceNotices
 
 _CORES_OF_A_PROCESS = 2
 """Cores that the streams of one process fill, about (`docs/results/processes.md`)."""
@@ -65,13 +66,21 @@ class Server(uvicorn.Server):
     """uvicorn with an orderly shutdown, which takes at most `drain.drain_s` and no time if nothing is in flight.
 
     The first SIGTERM or SIGINT begins the shutdown, and the exit code is 0. A second one ends the process at once.
-    `on_start` is called when the server accepts requests.
+    `on_start` is called when the server accepts requests. The event loop gives the signs of life of `notices`.
     """
 
-    def __init__(self, config: uvicorn.Config, drain: Drain, *, on_start: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        drain: Drain,
+        *,
+        on_start: Callable[[], None] = lambda: None,
+        notices: ServiceNotices | None = None,
+    ) -> None:
         super().__init__(config)
         self._drain = drain
         self._on_start = on_start
+        self._notices = ServiceNotices() if notices is None else notices
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_stopping = False
 
@@ -80,12 +89,19 @@ class Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._on_start()
+            self._notices.ready()
+
+    async def on_tick(self, counter: int) -> bool:
+        """uvicorn calls this ten times a second."""
+        self._notices.beat()
+        return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  uvicorn's signature
         """Begin the shutdown. uvicorn calls this as a signal handler, on the main thread."""
         if self._is_stopping:
             _end_process(128 + sig, f"{signal.Signals(sig).name} again: ended at once")
         self._is_stopping = self.should_exit = True
+        self._notices.stopping()
         end = threading.Timer(self._drain.drain_s, _cut_off, [self._drain.drain_s])
         end.daemon = True
         end.start()

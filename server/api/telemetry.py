@@ -8,7 +8,7 @@ import platform
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from importlib.metadata import version
-from typing import Protocol
+from typing import Protocol, get_args
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, InfoMetricFamily
@@ -17,6 +17,7 @@ from prometheus_client.registry import Collector
 
 from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
+from server.api.process_peers import Ending, ProcessPeers
 from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger, StreamTotals
@@ -63,6 +64,9 @@ class Host(Protocol):
     def refused_requests(self) -> RefusedRequests: ...
 
     @property
+    def peers(self) -> ProcessPeers | None: ...
+
+    @property
     def http_durations(self) -> HttpDurations: ...
 
     @property
@@ -98,6 +102,7 @@ class ServerCollector(Collector):
         is_draining = readiness.drain.has_begun
         yield GaugeMetricFamily("nafir_draining", "1 if the server is shutting down.", value=is_draining)
         yield from _threads(readiness.watch)
+        yield _endings(self._host.peers)
         yield _histogram(
             "nafir_event_loop_lag_seconds",
             "How much later than it was due the event loop came to a timer, ten times a second.",
@@ -251,6 +256,18 @@ def _threads(watch: ThreadWatch) -> Iterator[Metric]:
         restarts.add_metric([name], watch.restarts[name])
     yield healthy
     yield restarts
+
+
+def _endings(peers: ProcessPeers | None) -> Metric:
+    replaced = CounterMetricFamily(
+        "nafir_process_restarts",
+        "How often a process of several was replaced, since it had ended (died) or was ended because its event loop "
+        "did nothing any more (hung); a fault unless it is 0.",
+        labels=["reason"],
+    )
+    for reason in get_args(Ending):
+        replaced.add_metric([reason], 0 if peers is None else peers.endings.get(reason, 0))
+    return replaced
 
 
 def _admission(admission: Admission) -> Iterator[Metric]:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from server.field.field import AcousticField
     from server.offline.render import RenderedEmitter
     from server.planning.scene_acoustics import Output
+    from server.runtime.service_notices import ServiceNotices
     from server.scene.bundle import Bundle
 
 app = StrictTyper(
@@ -110,7 +111,9 @@ def serve(
     from server.api.listeners import bind, url_of
     from server.api.settings import checked_settings
     from server.runtime.logs import configure_logs
+    from server.runtime.service_notices import ServiceNotices
 
+    notices = ServiceNotices.take(os.environ)
     given = {"host": host, "port": port, "bundles": bundle, "clips": clip, "hrtfs": hrtf, "processes": processes}
     settings = checked_settings(given)
     configure_logs(settings.log_format, settings.log_level, lines_per_min=settings.log_lines_per_min)
@@ -119,7 +122,7 @@ def serve(
         listeners = [opened.enter_context(listener) for listener in bind(settings.host, settings.port)]
         url = url_of(listeners[0], settings.host)
         if settings.processes > 1:
-            _serve_in_processes(settings, given, listeners, url)
+            _serve_in_processes(settings, given, listeners, url, notices)
         from server.api.start import loaded_app
         from server.runtime.drain import Drain
         from server.runtime.memory import give_back_large_arrays
@@ -135,11 +138,15 @@ def serve(
         announcement = serving.announcement(scenes, url)
         config = uvicorn.Config(application, **serving.uvicorn_options(settings))
         on_start = lambda: Console().print(announcement, highlight=False)  # noqa: E731
-        serving.serve(serving.Server(config, drain, on_start=on_start), listeners)
+        serving.serve(serving.Server(config, drain, on_start=on_start, notices=notices), listeners)
 
 
 def _serve_in_processes(
-    settings: "Settings", given: Mapping[str, Any], listeners: "Sequence[socket.socket]", url: str
+    settings: "Settings",
+    given: Mapping[str, Any],
+    listeners: "Sequence[socket.socket]",
+    url: str,
+    notices: "ServiceNotices",
 ) -> NoReturn:
     from server.api.processes import ProcessGroup, shares_of_cores
 
@@ -147,7 +154,8 @@ def _serve_in_processes(
         raise NafirError("processes: this system cannot confine a process to cores: serve with one")
     shares = shares_of_cores(sorted(os.sched_getaffinity(0)), settings.processes)
     options = json.loads(json.dumps(given, default=str))
-    sys.exit(ProcessGroup(listeners, shares, options, url=url, drain_s=settings.drain_s).run())
+    group = ProcessGroup(listeners, shares, options, url=url, drain_s=settings.drain_s, notices=notices)
+    sys.exit(group.run())
 
 
 @app.command()

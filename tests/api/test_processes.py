@@ -2,6 +2,7 @@
 connects."""
 
 import json
+import math
 import os
 import signal
 import socket
@@ -16,7 +17,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from server.api.process_peers import merged
-from server.api.processes import Member, least_loaded, shares_of_cores
+from server.api.processes import HUNG_S, Member, least_loaded, shares_of_cores
 from server.core.errors import NafirError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot confine a process to cores")
@@ -27,6 +28,8 @@ MEMBER = textwrap.dedent("""
     told = json.loads(sys.argv[1])
     folder = told["options"]["folder"]
     number, channel = told["number"], socket.socket(fileno=told["channel"])
+    with open(f"{folder}/endings", "a") as file:
+        file.write(f"{number} {json.dumps(told['endings'])}\\n")
     with open(f"{folder}/started", "a") as file:
         file.write(f"{number} {os.getpid()} {sorted(os.sched_getaffinity(0))} {told['cores']} {told['url']}\\n")
     if os.path.exists(f"{folder}/refuse"):
@@ -60,15 +63,19 @@ MEMBER = textwrap.dedent("""
 
 GROUP = textwrap.dedent("""
     import logging, os, socket, sys
+    from server.api import processes as module
     from server.api.processes import ProcessGroup
+    from server.runtime.service_notices import ServiceNotices
     logging.basicConfig(level=logging.INFO)
-    folder, script, processes = sys.argv[1:]
+    folder, script, processes, hung_s = sys.argv[1:]
+    module.HUNG_S = float(hung_s)
     listener = socket.socket()
     listener.bind(("127.0.0.1", 0))
     listener.listen()
     print(listener.getsockname()[1], flush=True)
     group = ProcessGroup([listener], [[min(os.sched_getaffinity(0))]] * int(processes), {"folder": folder},
-                         url="here", drain_s=1.0, command=(sys.executable, script))
+                         url="here", drain_s=1.0, command=(sys.executable, script),
+                         notices=ServiceNotices.take(os.environ))
     sys.exit(group.run())
 """)
 
@@ -105,13 +112,14 @@ class Group:
 
 
 @contextmanager
-def running(folder, processes=2, **loads):
+def running(folder, processes=2, *, hung_s=HUNG_S, environment=None, **loads):
     script = folder / "member.py"
     script.write_text(MEMBER)
     for name, load in loads.items():
         (folder / f"load {name.removeprefix('of_')}").write_text(str(load))
-    command = [sys.executable, "-c", GROUP, str(folder), str(script), str(processes)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, "-c", GROUP, str(folder), str(script), str(processes), str(hung_s)]
+    pipe, variables = subprocess.PIPE, {**os.environ, **(environment or {})}
+    with subprocess.Popen(command, cwd=ROOT, env=variables, stdout=pipe, stderr=pipe, text=True) as process:
         try:
             yield Group(folder, process, int(process.stdout.readline()))
         finally:
@@ -173,6 +181,32 @@ def test_reports_may_come_in_pieces_and_the_last_one_counts():
     assert (each.is_ready, each.load, each.handed, each.reported_s) == (True, 0.25, 0, 2.0)
 
 
+def report(each, now_s):
+    each.read(b'{"is_ready": true, "load": 0}\n', now_s)
+
+
+def test_a_process_hangs_once_it_has_not_reported_for_long():
+    each = member(0)
+    report(each, 0.0)
+    for _ in range(int(HUNG_S / 0.5)):
+        each.wait(0.5)
+    assert not each.is_hung
+    each.wait(0.5)
+    assert each.is_hung
+    report(each, HUNG_S + 0.5)
+    assert not each.is_hung
+
+
+def test_a_long_start_and_a_machine_that_was_stopped_are_no_hang():
+    starting, working = (member(number, reported_s=-math.inf) for number in range(2))
+    report(working, 0.0)
+    for _ in range(10):
+        starting.wait(60.0)
+        working.wait(600.0)
+    assert not starting.is_hung
+    assert not working.is_hung
+
+
 def test_connections_that_come_together_are_spread_and_later_ones_go_where_there_is_room(group):
     assert sorted(group.connect() for _ in range(2)) == [0, 1]
     group.set_load(0, 0.9)
@@ -206,6 +240,43 @@ def test_a_process_that_dies_is_replaced_and_the_others_go_on(group):
     group.process.send_signal(signal.SIGTERM)
     assert group.process.wait(10) == 0
     assert "process 1 has ended with code -9 and is replaced" in group.process.stderr.read()
+
+
+def test_a_process_that_hangs_is_ended_and_replaced_and_the_others_go_on(tmp_path):
+    with running(tmp_path, hung_s=4.0) as group:
+        group.wait_for(lambda: len(group.started) == 2)
+        other, hung = (dict(group.started)[number] for number in range(2))
+        group.wait_for(lambda: {group.connect() for _ in range(2)} == {0, 1})  # it has reported
+        os.kill(hung, signal.SIGSTOP)
+        group.wait_for(lambda: len(group.started) == 3)
+        assert group.started[-1][0] == 1
+        assert not is_there(hung)
+        assert is_there(other)
+        group.wait_for(lambda: {group.connect() for _ in range(2)} == {0, 1})
+        group.process.send_signal(signal.SIGTERM)
+        assert group.process.wait(10) == 0
+        told = group.process.stderr.read()
+    assert "process 1 has not reported for 4 s and is ended" in told
+    assert "process 1 has ended with code -9 and is replaced" in told
+    assert (tmp_path / "endings").read_text().splitlines()[-1] == '1 {"hung": 1}'
+
+
+def test_systemd_is_told_that_the_first_process_serves_and_all_go_on_and_end(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(20)
+        asked = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+        with running(tmp_path, environment=asked) as group:
+            notices = []
+            while len(notices) < 2 or notices[-1] != b"WATCHDOG=1":
+                notices.append(systemd.recv(64))
+                if notices[-1] == b"READY=1":
+                    assert group.started
+            assert notices.count(b"READY=1") == 1
+            group.process.send_signal(signal.SIGTERM)
+            while (notice := systemd.recv(64)) != b"STOPPING=1":
+                assert notice == b"WATCHDOG=1"
+            assert group.process.wait(10) == 0
 
 
 def test_where_processes_die_again_and_again_the_server_says_so_and_ends(group, tmp_path):

@@ -7,7 +7,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
-from server.api.process_peers import merged
+from server.api.process_peers import ProcessPeers, merged
 from server.api.request_log import RefusedRequests
 from server.api.response_cache import ResponseCache
 from server.api.stream_counts import StreamLedger
@@ -39,6 +39,7 @@ class Host:
         self.audio, self.offers, self.clips = audio, offers, {"flat": Clips()}
         self.responses, self.http_durations = responses, HttpDurations()
         self.refused_bundles = 0
+        self.peers = None
         self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
         self.ledger = StreamLedger()
@@ -249,6 +250,15 @@ def test_of_several_processes_each_tells_its_own(host):
     assert [told["nafir_http_request_duration_seconds_count", each, "/livez"] for each in "01"] == [1, 2]
     assert [told["nafir_response_cache_lookups_total", each, "hit"] for each in "01"] == [0, 1]
     assert [told["nafir_event_loop_lag_seconds_count", each, None] for each in "01"] == [0, 0]
+
+
+def test_how_often_a_process_was_replaced_is_told_and_why(host):
+    name, reasons = "nafir_process_restarts_total", [("reason", "died"), ("reason", "hung")]
+    alone = samples(host)
+    host.peers = ProcessPeers(1, (1, 2), endings={"hung": 2})
+    told = samples(host)
+    assert [alone[name, reason] for reason in reasons] == [0, 0]
+    assert [told[name, reason] for reason in reasons] == [0, 2]
 
 
 def test_calls_of_stores_are_told_by_what_was_asked_and_how_it_failed(host):

@@ -147,6 +147,7 @@ class Host:
         self.clips: dict[str, Any] = {}
         self.offers: dict[str, Any] = {}
         self.refused_bundles = 0
+        self.peers = None
         self.stores = {"clips": StoreCalls()}
         self.refused_requests = RefusedRequests()
         self.http_durations = HttpDurations()
