@@ -257,12 +257,74 @@ def test_a_stream_of_which_too_much_is_unsaid_begins_anew():
     assert [json.loads(message)["type"] for message in drained(session.outbox)] == ["add_emitter"]
 
 
+def snapshot(text, handled):
+    return json.dumps({"type": "snapshot", "snapshot": text, "pose_id": 0, "handled": handled, "expires_s": 120.0})
+
+
+def test_the_newest_snapshot_goes_with_the_resume_and_what_it_covers_is_forgotten():
+    session = Session("flat", {})
+    assert json.loads(session.first_message())["snapshots"] is True
+    session.greet(resumable(), 0.0)
+    for level in "abc":
+        session.set_level(level)
+    drained(session.outbox)
+    session.receive(snapshot("older", 1), 0.0)
+    session.receive(snapshot("newer", 2), 0.0)
+    first = json.loads(session.first_message())
+    assert (first["type"], first["token"], first["snapshot"]) == ("resume", "t1", "newer")
+    assert not session.outbox.can_resume(1)
+    session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=2), 0.0)
+    assert [json.loads(each)["level"] for each in drained(session.outbox)] == ["c"]
+    # What was handled counts on: the stream may be resumed by the same snapshot again.
+    session.set_level("d")
+    drained(session.outbox)
+    session.first_message()
+    session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=2), 0.0)
+    assert [json.loads(each)["level"] for each in drained(session.outbox)] == ["c", "d"]
+    assert session.statistics.resumptions == 2
+
+
+def test_a_server_that_keeps_nothing_may_have_given_a_snapshot():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(WELCOME, 0.0)
+    session.receive(snapshot("sealed", 0), 0.0)
+    session.receive(wire_block(4, 1_024), 0.0)
+    first = json.loads(session.first_message())
+    assert first == {"type": "resume", "protocol": 3, "snapshot": "sealed", "sequence": 4, "sample_clock": 1_024}
+
+
+def test_an_emitter_and_a_listener_that_a_snapshot_lacks_are_there_once_they_are_added_again():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.receive(snapshot("sealed", 0), 0.0)
+    fields = {"id": "late", "live": True, "position": (1.0, 2.0, 1.0)}
+    late = session.add_emitter(fields, session.live_input(4, 1.0))
+    second = session.add_listener("second", Pose.of((1, 1, 1)), None)
+    drained(session.outbox)
+    session.receive('{"type": "emitter_added", "id": "late", "sample_clock": 256}', 0.0)
+    session.receive('{"type": "listener_added", "id": "second", "index": 1, "sample_clock": 256}', 0.0)
+    assert (late.is_heard, second.is_there) == (True, True)
+    session.disconnect()
+    session.first_message()
+    session.greet(resumable(sample_clock=768, sequence=3, pose_id=0, handled=0), 1.0)
+    assert (late.is_heard, second.is_there) == (False, False)
+    late.live.write(np.ones(1_000, np.float32))
+    session.pump()
+    # Nothing is said of them before they are there.
+    assert [json.loads(each)["type"] for each in drained(session.outbox)] == ["add_emitter", "add_listener"]
+    session.receive('{"type": "emitter_added", "id": "late", "sample_clock": 1024}', 1.0)
+    assert (late.is_heard, late.start_clock, len(session.outbox)) == (True, 1_024, 3)
+
+
 def test_where_no_stream_is_kept_a_hello_begins_anew():
     session = Session("flat", {})
     session.first_message()
     session.greet(resumable(), 0.0)
     session.add_emitter({"id": "talker", "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
     drained(session.outbox)
+    session.receive(snapshot("of another server", 0), 0.0)
     assert json.loads(session.first_message())["type"] == "resume"
     with pytest.raises(RefusedError) as refused:
         session.greet('{"type": "error", "code": "unknown_resume_token", "message": "no"}', 0.0)

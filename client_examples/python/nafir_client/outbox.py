@@ -1,7 +1,8 @@
 """Messages that wait to be sent, in order. Of poses and acknowledgements only the newest waits.
 
 A server that resumes a stream says how many messages it has handled, of those that are *counted*: texts that change
-something and are not poses. They are kept after they were sent, so that the others can be sent again.
+something and are not poses. They are kept after they were sent, until a snapshot covers them, so that the others can be
+sent again.
 """
 
 from collections import deque
@@ -75,6 +76,11 @@ class Outbox:
     def can_resume(self, handled: int) -> bool:
         """Whether all counted messages but the first so many are still there."""
         return self._sent_count - handled <= len(self._sent)
+
+    def forget(self, handled: int) -> None:
+        """The first so many counted messages need not be sent again."""
+        while self._sent and self._sent_count - len(self._sent) < handled:
+            self._sent.popleft()
 
     def resume(self, handled: int) -> None:
         """The server has handled so many counted messages of this stream. The others wait again, before all else."""

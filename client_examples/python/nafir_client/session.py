@@ -3,6 +3,10 @@
 A session outlives its connections. It knows what the stream should be (listeners, emitters, level, effects), so that a
 new connection can be made to be what the last one was. The clock goes on over connections: sample clocks are those of
 the session, not of the server.
+
+A new connection resumes the stream by the token of the last one, at the server that kept it, or by the newest
+*snapshot* that a server has sent, at any server of the same scenes and secret. A snapshot is older than the last block,
+so what it does not cover is said again.
 """
 
 import json
@@ -164,7 +168,7 @@ class Session:
         self.listener: Pose | None = given.pop("listener", None)
         if given["encoding"] == "opus":
             require_opus()
-        self._hello = {"type": "hello", "protocol": PROTOCOL, "scene": scene, **given}
+        self._hello = {"type": "hello", "protocol": PROTOCOL, "scene": scene, "snapshots": True, **given}
         self.outbox = Outbox()
         self.emitters: dict[str, SessionEmitter] = {}
         self.listeners: dict[str, SessionListener] = {}
@@ -182,6 +186,8 @@ class Session:
         self._next_pose_id = 1
         self._listener_pose_id = 0
         self._resume_token: str | None = None
+        self._snapshot: str | None = None
+        """The newest one of this stream."""
         self._last_block: tuple[int, int] | None = None
         """The greatest number and the greatest of the server's clocks of all blocks, whoever's they are."""
         self._packets: OpusReader | None = None
@@ -191,10 +197,13 @@ class Session:
         self._ping_id = 0
 
     def first_message(self) -> str:
-        """That of a connection: it resumes the stream, if the server has given a token for that, or opens one."""
-        if self._resume_token is None:
+        """That of a connection: it resumes the stream, if the server has given a token or a snapshot for that, or opens
+        one."""
+        given = {"token": self._resume_token, "snapshot": self._snapshot}
+        means = {name: value for name, value in given.items() if value is not None}
+        if not means:
             return self._open()
-        resume: dict[str, Any] = {"type": "resume", "protocol": PROTOCOL, "token": self._resume_token}
+        resume: dict[str, Any] = {"type": "resume", "protocol": PROTOCOL, **means}
         if self._last_block is not None:
             resume["sequence"], resume["sample_clock"] = self._last_block
         return json.dumps(resume)
@@ -226,13 +235,13 @@ class Session:
         if answer["type"] == "error":
             error = refusal(answer)
             if error.code == _TOKEN_UNKNOWN:
-                self._resume_token = None
+                self._begin_anew()
             raise error
         if answer["type"] != "welcome":
             raise ProtocolError(f"the server answers a first message with {answer['type']}")
         resumed = answer.get("resumed")
         if resumed is not None and not self.outbox.can_resume(resumed["handled"]):
-            self._resume_token = None
+            self._begin_anew()
             raise RefusedError(_TOKEN_UNKNOWN, "too much was said since to go on with the stream: it begins anew")
         is_first, self.welcome = self.welcome is None, Welcome.read(answer)
         self.level = self.welcome.level
@@ -240,6 +249,7 @@ class Session:
         self._pings.clear()
         self._resume_token = answer.get("resume_token")
         if resumed is not None:
+            self.statistics.resumptions += 1
             self._resume(resumed["pose_id"], resumed["handled"], resumed["sample_clock"], now_s)
             self._resume_listeners(resumed, now_s)
         else:
@@ -250,16 +260,23 @@ class Session:
             self.outbox.put_first(listeners + [self._added(emitter) for emitter in self._restored])
         return self.welcome
 
+    def _begin_anew(self) -> None:
+        """With the next connection, since nobody can go on with the stream."""
+        self._resume_token = self._snapshot = None
+
     def _resume(self, pose_id: int, handled: int, sample_clock: int, now_s: float) -> None:
         """The stream goes on where it would be: what the server has not got is sent again."""
         self.outbox.resume(handled)
+        added = self.outbox.adds
         if self.listener is not None and self._listener_pose_id > pose_id:
             self.move_listener(self.listener, now_s)
         for emitter in self.emitters.values():
             if emitter.pose_id > pose_id:
                 orientation = emitter.fields.get("orientation")
                 self.move_emitter(emitter, emitter.fields["position"], orientation, now_s)
-            if not emitter.is_heard and ("emitter", emitter.id) not in self.outbox.adds:
+            if ("emitter", emitter.id) in added:
+                emitter.is_heard = False  # a server that goes by a snapshot may lack what the last one had
+            elif not emitter.is_heard:
                 # It is there, and that it is heard may have been said just before the connection was lost.
                 emitter.is_heard, emitter.start_clock = True, sample_clock + self._clock_offset
             if emitter.live and emitter.is_heard:
@@ -268,9 +285,11 @@ class Session:
     def _resume_listeners(self, resumed: Mapping[str, Any], now_s: float) -> None:
         """Listeners that the server has go on. Those that it should have and has not are asked for again."""
         there = {each["id"]: each["index"] for each in resumed.get("listeners", ())}
+        added = self.outbox.adds
         for listener in self.listeners.values():
-            if ("listener", listener.id) in self.outbox.adds:
-                continue  # if the server has one of this id, it is to remove that first
+            if ("listener", listener.id) in added:
+                listener.index = None  # if the server has one of this id, it is to remove that first
+                continue
             index = there.get(listener.id)
             if index is None and listener.is_there:
                 listener.index = None  # it cannot be there any more, and an error will say why
@@ -573,6 +592,9 @@ class Session:
                 self.level = level
             case {"type": "status", "live": live}:
                 self._correct(live)
+            case {"type": "snapshot", "snapshot": str(snapshot), "handled": int(handled)}:
+                self._snapshot = snapshot
+                self.outbox.forget(handled)
             case {"type": "pong", "id": identifier} if identifier in self._pings:
                 self.statistics.round_trip.add(now_s - self._pings.pop(identifier))
             case {"type": "error"}:

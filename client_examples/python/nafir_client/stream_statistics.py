@@ -85,11 +85,14 @@ class StreamStatistics(ListenerStatistics):
     """Those of the first listener, and of the stream's connections."""
 
     reconnections: int = 0
+    resumptions: int = 0
+    """How many of them went on with the stream; the others began it anew."""
     round_trip: Durations = field(default_factory=Durations)
 
     def summary(self) -> dict[str, float]:
         return {
             **super().summary(),
             "reconnections": self.reconnections,
+            "resumptions": self.resumptions,
             "round_trip_ms": self.round_trip.median_ms,
         }
