@@ -39,7 +39,7 @@ url=http://127.0.0.1:$port
 say() { printf '\n== %s\n' "$*"; }
 fail() { printf 'container test failed: %s\n' "$*" >&2; exit 1; }
 
-for program in buildah podman runc curl python3; do
+for program in buildah podman podman-compose runc curl python3; do
     command -v "$program" >/dev/null || fail "$program is not installed"
 done
 [ "$(id -u)" -eq 0 ] || fail "run it as root: the base system and the image store are made as root"
@@ -247,56 +247,53 @@ stop_server
 
 # deploy/compose.yaml itself, in its own networks. Images that it names are pulled with PULL_BASE=1, or made of the base and the
 # program of this name that the host has; a service without either is left out.
-if ! command -v podman-compose >/dev/null; then
-    say "podman-compose is not installed: deploy/compose.yaml is not tried"
-else
-    say "running deploy/compose.yaml"
-    ! curl --silent --output /dev/null http://127.0.0.1:80 || fail "port 80, which Caddy takes, is in use"
-    deploy=$state/deploy
-    secrets=$deploy/secrets
-    rm -rf "$deploy"
-    cp --recursive "$root/deploy" "$deploy"
-    mkdir -p "$secrets/keys"
-    printf 'IMAGE=localhost/%s\nDOMAIN=localhost\nRESUME_SECRET=%s\n' "$image" "$(head -c 18 /dev/urandom | base64)" >"$deploy/.env"
-    nafir_keys() { run_podman run --rm --no-healthcheck --network none "${ulimits[@]}" --volume "$secrets/keys:/keys" --user 0 "$image" keys "$@"; }
-    nafir_keys create --file /keys/keys.json --scope metrics >"$secrets/metrics-key"
-    echo container-test >"$secrets/grafana-password"
-    chmod 644 "$secrets/keys/keys.json" "$secrets/metrics-key" "$secrets/grafana-password"
+say "running deploy/compose.yaml"
+! curl --silent --output /dev/null http://127.0.0.1:80 || fail "port 80, which Caddy takes, is in use"
+deploy=$state/deploy
+secrets=$deploy/secrets
+rm -rf "$deploy"
+cp --recursive "$root/deploy" "$deploy"
+mkdir -p "$secrets/keys"
+printf 'IMAGE=localhost/%s\nDOMAIN=localhost\nRESUME_SECRET=%s\n' "$image" "$(head -c 18 /dev/urandom | base64)" >"$deploy/.env"
+nafir_keys() { run_podman run --rm --no-healthcheck --network none "${ulimits[@]}" --volume "$secrets/keys:/keys" --user 0 "$image" keys "$@"; }
+nafir_keys create --file /keys/keys.json --scope metrics >"$secrets/metrics-key"
+echo container-test >"$secrets/grafana-password"
+chmod 644 "$secrets/keys/keys.json" "$secrets/metrics-key" "$secrets/grafana-password"
 
-    make_image() {
-        mkdir -p "$state/$1"
-        cp "$(command -v "$1")" "$state/$1/program"
-        printf 'FROM localhost/%s\nCOPY program /usr/bin/%s\n%s\n' "$base" "$1" "$3" >"$state/$1/Dockerfile"
-        buildah "${store[@]}" bud --quiet --isolation chroot --format docker --pull-never --tag "$2" "$state/$1" >/dev/null
-    }
-    services=(server)
-    for wanted in $(sed -n 's/^ *image: \([a-z]\)/\1/p' "$deploy/compose.yaml"); do
-        service=${wanted##*/}
-        service=${service%%:*}
-        [[ $wanted = */* ]] || wanted=library/$wanted
-        wanted=docker.io/$wanted
-        if run_podman image exists "$wanted"; then
-            :
-        elif [ -n "${PULL_BASE:-}" ]; then
-            run_podman pull --quiet "$wanted"
-        elif [ "$service" = caddy ] && command -v caddy >/dev/null; then
-            make_image caddy "$wanted" 'ENV XDG_DATA_HOME=/data XDG_CONFIG_HOME=/config
+make_image() {
+    mkdir -p "$state/$1"
+    cp "$(command -v "$1")" "$state/$1/program"
+    printf 'FROM localhost/%s\nCOPY program /usr/bin/%s\n%s\n' "$base" "$1" "$3" >"$state/$1/Dockerfile"
+    buildah "${store[@]}" bud --quiet --isolation chroot --format docker --pull-never --tag "$2" "$state/$1" >/dev/null
+}
+services=(server)
+for wanted in $(sed -n 's/^ *image: \([a-z]\)/\1/p' "$deploy/compose.yaml"); do
+    service=${wanted##*/}
+    service=${service%%:*}
+    [[ $wanted = */* ]] || wanted=library/$wanted
+    wanted=docker.io/$wanted
+    if run_podman image exists "$wanted"; then
+        :
+    elif [ -n "${PULL_BASE:-}" ]; then
+        run_podman pull --quiet "$wanted"
+    elif [ "$service" = caddy ] && command -v caddy >/dev/null; then
+        make_image caddy "$wanted" 'ENV XDG_DATA_HOME=/data XDG_CONFIG_HOME=/config
 CMD ["caddy", "run", "--config", "/etc/caddy/Caddyfile", "--adapter", "caddyfile"]'
-        elif [ "$service" = prometheus ] && command -v prometheus >/dev/null; then
-            make_image prometheus "$wanted" 'RUN mkdir /prometheus && chown 65534:65534 /prometheus
+    elif [ "$service" = prometheus ] && command -v prometheus >/dev/null; then
+        make_image prometheus "$wanted" 'RUN mkdir /prometheus && chown 65534:65534 /prometheus
 USER 65534
 ENTRYPOINT ["prometheus"]'
-        else
-            echo "$service is left out: it has no image"
-            continue
-        fi
-        services+=("$service")
-    done
-    [[ " ${services[*]} " = *" caddy "* ]] || fail "caddy is not installed"
+    else
+        echo "$service is left out: it has no image"
+        continue
+    fi
+    services+=("$service")
+done
+[[ " ${services[*]} " = *" caddy "* ]] || fail "caddy is not installed"
 
-    # podman-compose's podman: the store of this script, and the limits that this host can give.
-    printf '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=4096:4096"]\n' >"$state/containers.conf"
-    cat >"$state/podman" <<PODMAN
+# podman-compose's podman: the store of this script, and the limits that this host can give.
+printf '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=4096:4096"]\n' >"$state/containers.conf"
+cat >"$state/podman" <<PODMAN
 #!/usr/bin/env bash
 arguments=()
 for argument in "\$@"; do
@@ -307,36 +304,36 @@ done
 CONTAINERS_CONF=$state/containers.conf exec $(command -v podman) ${store[*]} \
     --runtime $(command -v runc) --cgroup-manager cgroupfs "\${arguments[@]}"
 PODMAN
-    chmod +x "$state/podman"
-    run_compose() { (cd "$deploy" && podman-compose --podman-path "$state/podman" --project-name nafir-test "$@") >>"$state/compose.log" 2>&1; }
-    : >"$state/compose.log"
-    composed=yes
-    started=$SECONDS
-    run_compose up --detach --no-build "${services[@]}" || { cat "$state/compose.log"; fail "compose does not start"; }
-    container=nafir-test_server_1
-    tls=https://localhost
-    authority=$state/root.crt
-    until run_podman cp nafir-test_caddy_1:/data/caddy/pki/authorities/local/root.crt "$authority" 2>/dev/null &&
-        curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
-        ((SECONDS - started < 180)) || { cat "$state/compose.log"; run_podman logs "$container"; fail "not ready behind TLS after 180 s"; }
-        sleep 0.5
-    done
-    echo "${services[*]}: ready behind TLS in $((SECONDS - started)) s"
-    ! run_podman logs "$container" 2>&1 | grep --quiet "compiling for this processor" ||
-        fail "it compiles what the image should hold"
-    run_podman exec "$container" python -c 'open("/cache/probe", "w")' || fail "nothing can be kept in /cache"
+chmod +x "$state/podman"
+run_compose() { (cd "$deploy" && podman-compose --podman-path "$state/podman" --project-name nafir-test "$@") >>"$state/compose.log" 2>&1; }
+: >"$state/compose.log"
+composed=yes
+started=$SECONDS
+run_compose up --detach --no-build "${services[@]}" || { cat "$state/compose.log"; fail "compose does not start"; }
+container=nafir-test_server_1
+tls=https://localhost
+authority=$state/root.crt
+until run_podman cp nafir-test_caddy_1:/data/caddy/pki/authorities/local/root.crt "$authority" 2>/dev/null &&
+    curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
+    ((SECONDS - started < 180)) || { cat "$state/compose.log"; run_podman logs "$container"; fail "not ready behind TLS after 180 s"; }
+    sleep 0.5
+done
+echo "${services[*]}: ready behind TLS in $((SECONDS - started)) s"
+! run_podman logs "$container" 2>&1 | grep --quiet "compiling for this processor" ||
+    fail "it compiles what the image should hold"
+run_podman exec "$container" python -c 'open("/cache/probe", "w")' || fail "nothing can be kept in /cache"
 
-    key=$(nafir_keys create --file /keys/keys.json --scope listen --scope render)
-    status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
-    [ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
-    made=$SECONDS
-    until [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ]; do
-        ((SECONDS - made < 20)) || fail "a key made while the server runs opens nothing after 20 s"
-        sleep 0.5
-    done
-    [ "$(status -H "Authorization: Bearer $(<"$secrets/metrics-key")" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
-    if [[ " ${services[*]} " = *" prometheus "* ]]; then
-        run_podman exec "$container" python -c '
+key=$(nafir_keys create --file /keys/keys.json --scope listen --scope render)
+status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
+[ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
+made=$SECONDS
+until [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ]; do
+    ((SECONDS - made < 20)) || fail "a key made while the server runs opens nothing after 20 s"
+    sleep 0.5
+done
+[ "$(status -H "Authorization: Bearer $(<"$secrets/metrics-key")" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
+if [[ " ${services[*]} " = *" prometheus "* ]]; then
+    run_podman exec "$container" python -c '
 import json, time, urllib.request
 
 for _ in range(60):
@@ -347,12 +344,12 @@ for _ in range(60):
 assert target["health"] == "up", target["lastError"]
 print("Prometheus reads", target["scrapeUrl"])
 '
-    fi
-    # From outside the networks of compose, through the port of Caddy, by a user who is not root.
-    chmod 644 "$authority"
-    run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$root/client_examples/python/nafir_client:/client/nafir_client:ro" \
-        --volume "$authority:/client/root.crt:ro" --workdir /client --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/client/root.crt \
-        --entrypoint python "$image" -c '
+fi
+# From outside the networks of compose, through the port of Caddy, by a user who is not root.
+chmod 644 "$authority"
+run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$root/client_examples/python/nafir_client:/client/nafir_client:ro" \
+    --volume "$authority:/client/root.crt:ro" --workdir /client --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/client/root.crt \
+    --entrypoint python "$image" -c '
 import sys
 
 import soundfile
@@ -369,11 +366,10 @@ print(f"{len(samples) / rate:.2f} s heard through wss, peak {peak:.4f}")
 assert len(samples) > 2 * rate and 0.001 < peak <= 1, "silence"
 ' listen wss://localhost --scene "$scene" --seconds 3 --silent --output /dev/shm/heard.wav
 
-    say "stopping it"
-    started=$SECONDS
-    run_compose stop server
-    code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
-    echo "stopped in $((SECONDS - started)) s with exit code $code"
-    [ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
-fi
+say "stopping it"
+started=$SECONDS
+run_compose stop server
+code=$(run_podman inspect "$container" --format '{{.State.ExitCode}}')
+echo "stopped in $((SECONDS - started)) s with exit code $code"
+[ "$code" -eq 0 ] || { run_podman logs "$container"; fail "exit code $code on SIGTERM"; }
 say "container test passed"

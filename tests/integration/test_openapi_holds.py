@@ -20,7 +20,7 @@ def schemathesis(address, folder, *, config, examples):
             *(sys.executable, "-m", "schemathesis.cli", "run", f"http://{address}/openapi.json"),
             *("--checks", "all", "--seed", "1", "--max-examples", str(examples), "--no-color"),
             *("--request-timeout", "60", "--max-response-time", "60"),  # on a busy machine
-            # Not stateful: sequences of requests follow links, of which a server that keeps nothing has none.
+            # Not stateful: sequences of requests follow links, and the document has none.
             *("--phases", "examples,coverage,fuzzing"),
         ],
         cwd=folder,

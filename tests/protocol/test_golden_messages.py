@@ -27,7 +27,11 @@ OF_CLIENTS = [
     '{"type": "resume", "protocol": 3, "snapshot": "c3RhdGU="}',
     '{"type": "add_emitter", "id": "a", "clip": "speech", "position": [6, 3, 1.5], "yaw": 3.0, "gain_db": -6.0,'
     ' "loop": false, "directivity": {"pattern": "cardioid", "order": 2}}',
-    '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "orientation": [0, 0, 0, 1]}',
+    '{"type": "add_emitter", "id": "a", "live": true, "position": [6, 3, 1.5], "orientation": [0, 0, 0, 1],'
+    ' "jitter_ms": 40.0}',
+    '{"type": "add_emitter", "id": "a", "clip": "speech", "position": [6, 3, 1.5],'
+    ' "directivity": {"pattern": "measured", "angles_deg": [0, 180],'
+    ' "gains_db": [[0, -1], [0, -2], [0, -3], [0, -4], [0, -6], [0, -9], [0, -12]]}}',
     '{"type": "add_emitter", "id": "a", "clip": "speech", "position": [6, 3, 1.5], "start_at": 4800, "stop_at": 9600,'
     ' "offset_s": 0.5, "loop_start_s": 0.25, "loop_end_s": 0.75, "remove_when_ended": true}',
     '{"type": "stop_emitter", "id": "a", "stop_at": 9600, "fade_s": 0.25}',
@@ -96,7 +100,7 @@ OF_THE_SERVER = [
     f' "unacknowledged": 3, "buffer_ms": 80.5, "render_ms": {_TIMES}, "lateness_ms": {_TIMES}, "ir_ms": {_TIMES},'
     f' "pose_ms": {_TIMES}, "reverberation_ms": {_TIMES}, "ir_exchanges": 4, "blocks_limited": 5, "level": "fine",'
     ' "ir_rate_hz": null, "live": [{"id": "a", "samples_queued": 1, "samples_dropped": 2, "samples_gated": 3,'
-    ' "samples_concealed": 4, "underruns": 5}]}',
+    ' "samples_concealed": 4, "underruns": 5, "blocks_lost": 6, "samples_awaited": 7}]}',
     '{"type": "pong", "id": 3}',
     _WELCOME[:-1] + ', "max_listeners": 8, "resumed": {"sample_clock": 4096, "sequence": 8, "pose_id": 3, "handled": 2,'
     ' "listeners": [{"id": "p2", "index": 1}]}}',
