@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import typer
 
 from server.api.app import create_app
+from server.api.connection_limits import ConnectionLimits
 from server.api.http_durations import HttpDurations
 from server.api.kept_streams import KeptStreams
 from server.api.problem_codes import PROBLEM_CODES
@@ -19,6 +21,7 @@ from server.api.response_cache import ResponseCache
 from server.api.settings import Settings
 from server.api.stream_counts import StreamLedger
 from server.api.telemetry import ServerCollector
+from server.assets.upload_decoder import DecodingLimits
 from server.cli.main import app as nafir
 from server.core.stores import StoreCalls
 from server.protocol.codes import CLOSE_CODES, ERROR_CODES
@@ -49,10 +52,116 @@ def test_every_setting_is_listed_and_explained(site: Path, page: Page) -> None:
     assert [row[0] for row in cells if row and not row[-1].strip()] == []
 
 
-def test_every_limit_is_listed_where_one_secures_a_server(page: Page) -> None:
-    limits = {f"NAFIR_{name.upper()}" for name in Settings.model_fields if name.startswith("max_") or "_per_" in name}
-    assert len(limits) > 12
-    assert limits <= words(page("how-to/secure"))
+@pytest.fixture(scope="module")
+def limits() -> Iterator[Any]:
+    """The generator of the table of limits."""
+    sys.path.insert(0, str(SERVER.parent / "docs" / "hooks"))
+    try:
+        import reference_limits
+
+        yield reference_limits
+    finally:
+        sys.path.pop(0)
+
+
+OF_A_LIMIT = re.compile(
+    r"_?(MAX|MOST|LONGEST|LARGEST|BIGGEST|WIDEST|DEEPEST|HIGHEST|FASTEST|LOUDEST|FINEST)(_|$)|\w+_(COST|PER_S|QUEUE_S|QUOTA|LIMIT)$"
+)
+"""Names of numbers that may limit what somebody can take."""
+PACKAGES = (
+    *(
+        "api",
+        "assets",
+        "core",
+        "field",
+        "planning",
+        "protocol",
+        "rendering",
+        "responses",
+        "runtime",
+        "scene",
+        "streaming",
+    ),
+)
+NO_LIMITS = {
+    "what the server does by itself": """
+        server.api.processes:_LONGEST_LOOK_S server.api.processes:_MOST_DEATHS
+        server.api.process_peers:_MOST_ANSWER_BYTES server.api.request_log:_LONGEST_PATH
+        server.api.response_cache:_LONGEST_RETRY_S server.api.telemetry:_LONGEST_S
+        server.api.turn_taking:_LONGEST_PAUSE_S
+        server.assets.shared_clips:_BYTES_PER_S server.assets.shared_clips:_MOST_CALLS server.core.near_names:_LONGEST
+        server.runtime.logs:_MOST_KINDS
+        server.runtime.logs:_MOST_TOGETHER server.runtime.pace:_LONGEST_NAP_S server.runtime.thread_watch:_MOST_DEATHS
+        server.streaming.audio_engine:_MOST_AT_A_TICK server.streaming.calibration:_MOST_MS
+        server.streaming.session:_MOST_DOOR_INTERVAL_S server.streaming.stream:_MAX_BEHIND_S
+        server.streaming.stream_times:_MOST_WAITING server.streaming.audience:_MOST_NUMBER
+        server.scene.outline:_MOST_FAULTS_TOLD server.rendering.mixer_set:_MOST
+    """,
+    "follows from another limit": """
+        server.api.inflow:_MOST_FRAMES server.rendering.ingest:LOUDEST_GAIN server.rendering.partitions:LARGEST_BLOCK
+        server.scene.bundle:_WIDEST_SAMPLE_BYTES
+    """,
+    "acoustics": """
+        server.assets.audio_file:_MOST_CANCELLED server.field.band_tail_kernel:MOST_IN_A_BAND
+        server.field.directions_kernel:_MOST_HARMONICS server.field.gate:MOST_GIVEN server.field.lattice:_MOST_MOVED_M
+        server.planning.change:MOST_JND server.planning.effect_costs:_LONGEST_S server.planning.motion:_FASTEST_M_S
+        server.planning.places:_LONGEST_S server.planning.plan_figure:_MOST_JND
+        server.planning.planned_effects:_LONGEST_S server.planning.planned_effects:_MOST_PERIODS
+        server.planning.effect_costs:RESPONSES_PER_S
+        server.rendering.sofa_file:_HIGHEST_RAD server.rendering.sphere:_WIDEST_GAP
+    """,
+}
+
+
+def numbers_that_may_be_limits() -> set[str]:
+    """Names in the source, as `MODULE:NAME`."""
+    found = set()
+    for path in (each for package in PACKAGES for each in (SERVER / package).rglob("*.py")):
+        module = ".".join(path.relative_to(SERVER.parent).with_suffix("").parts)
+        for statement in ast.parse(path.read_text()).body:
+            match statement:
+                case ast.Assign(targets=targets):
+                    names = [each for target in targets for each in ast.walk(target)]
+                case ast.AnnAssign(target=target):
+                    names = [target]
+                case _:
+                    continue
+            found |= {
+                f"{module}:{each.id}" for each in names if isinstance(each, ast.Name) and OF_A_LIMIT.match(each.id)
+            }
+    return found
+
+
+def test_every_limit_has_a_line_in_the_one_table(limits: Any, page: Page) -> None:
+    text = limits.limits()
+    assert text.count("| --- | --- |") == 1
+    listed = [each.place for each in limits.FIXED_LIMITS]
+    assert len(listed) == len(set(listed))
+    passed_over = [name for names in NO_LIMITS.values() for name in names.split()]
+    found = numbers_that_may_be_limits()
+    assert found - {*listed} - {*passed_over} == set(), "give it a line in FIXED_LIMITS, or a reason in NO_LIMITS"
+    assert {*passed_over} <= found - {*listed}
+    told = " ".join(page("how-to/secure").split())
+    for each in limits.FIXED_LIMITS:
+        assert each.value >= 0
+        assert each.what.replace("`", "") in told, each.what
+
+
+def test_every_setting_that_is_a_number_is_a_limit_or_said_to_be_none(limits: Any, page: Page) -> None:
+    numbers = {name for name, field in Settings.model_fields.items() if {int, float} & {field.annotation}}
+    assert numbers > limits.NO_LIMITS
+    names = {f"NAFIR_{name.upper()}" for name in numbers - limits.NO_LIMITS}
+    assert {"NAFIR_CLIPS_QUOTA_BYTES", "NAFIR_CLIPS_EXPIRE_S", "NAFIR_RESUME_S", "NAFIR_SNAPSHOT_LIFETIME_S"} < names
+    assert names <= words(page("how-to/secure"))
+
+
+def test_limits_of_whole_classes_are_all_listed(limits: Any) -> None:
+    listed = {each.place for each in limits.FIXED_LIMITS}
+    settings = {*Settings.model_fields}
+    for limited in (ConnectionLimits, DecodingLimits):
+        # Of an upload's seconds and bytes there are settings of another name.
+        for each in {field.name for field in dataclasses.fields(limited)} - settings - {"seconds", "max_upload_bytes"}:
+            assert f"{limited.__module__}:{limited.__name__}.{each}" in listed
 
 
 def commands(program: str, command: Any) -> Iterator[tuple[str, Any]]:
