@@ -21,12 +21,21 @@ def energy_of(samples: Any) -> float:
     return energy
 
 
+@compiled_loosely
+def _single_energy_of(samples: Any) -> np.float32:
+    """As `energy_of`, in single precision, in half the time."""
+    energy = np.float32(0.0)
+    for n in range(len(samples)):
+        energy += samples[n] * samples[n]
+    return energy
+
+
 @compiled
 def first_not_finite(signals: Float32) -> int:
     """The number of the first of some signals (B, channel, sample) with a sample that is not finite, or whose energy in
     a channel is no float32; -1 if there is none."""
     for row in range(signals.shape[0]):
         for channel in range(signals.shape[1]):
-            if not energy_of(signals[row, channel]) <= _MOST:
+            if not _single_energy_of(signals[row, channel]) <= _MOST:
                 return row
     return -1

@@ -81,19 +81,22 @@ def transform_lanes(like: Any, values: int, points: int, step: int, imaginary: i
 @compiled
 def transform_halved(like: Any, values: int, points: int, step: int, imaginary: int, passes: int) -> None:
     """Do the part of `transform_lanes` after the pass of radix 2, if there is one."""
-    _turned_passes(like, values, points, step, imaginary, passes)
     if first_span(points) == 0:
         return
-    for at in range(0, step * points, 4 * step):
-        y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(like, values, imaginary, at, step)
-        store(values, at, y0r)
-        store(values, imaginary + at, y0i)
-        store(values, at + step, y1r)
-        store(values, imaginary + at + step, y1i)
-        store(values, at + 2 * step, y2r)
-        store(values, imaginary + at + 2 * step, y2i)
-        store(values, at + 3 * step, y3r)
-        store(values, imaginary + at + 3 * step, y3i)
+    size = step * points
+    part = size // 2 if is_odd_power(points) else size
+    for begin in range(0, size, part):
+        _turned_passes(like, values, begin, begin + part, points, step, imaginary, passes)
+        for at in range(begin, begin + part, 4 * step):
+            y0r, y0i, y1r, y1i, y2r, y2i, y3r, y3i = butterfly(like, values, imaginary, at, step)
+            store(values, at, y0r)
+            store(values, imaginary + at, y0i)
+            store(values, at + step, y1r)
+            store(values, imaginary + at + step, y1i)
+            store(values, at + 2 * step, y2r)
+            store(values, imaginary + at + 2 * step, y2i)
+            store(values, at + 3 * step, y3r)
+            store(values, imaginary + at + 3 * step, y3i)
 
 
 @compiled
@@ -101,20 +104,23 @@ def transform_but_last(like: Any, values: int, points: int, step: int, imaginary
     """Do all passes except the last, whose butterflies each combine four neighbours without twiddles."""
     if is_odd_power(points):
         _halve(like, values, points, step, imaginary, passes)
-    _turned_passes(like, values, points, step, imaginary, passes)
+    size = step * points
+    part = size // 2 if is_odd_power(points) else size
+    for begin in range(0, size, part):
+        _turned_passes(like, values, begin, begin + part, points, step, imaginary, passes)
 
 
 @compiled
-def _turned_passes(like, values, points, step, imaginary, passes) -> None:
-    """Do the radix-4 passes except the last."""
-    size = step * points
+def _turned_passes(like, values, begin, end, points, step, imaginary, passes) -> None:
+    """Do the radix-4 passes except the last, from `begin` to `end`: all, or one of the halves that the pass of radix 2
+    leaves, which then fits into a cache where both do not."""
     table = points if is_odd_power(points) else 0
     span = first_span(points)
     while span > 1:
         for j in range(span):
             # A range with this step would need a division to find its length.
-            at = step * j
-            while at < size:
+            at = begin + step * j
+            while at < end:
                 _turned_butterfly(like, values, imaginary, at, step * span, passes, table + 6 * j)
                 at += 4 * step * span
         table += 6 * span
