@@ -108,6 +108,15 @@ def test_one_key_switches_between_a_level_and_the_direct_sound_alone(page):
     page.wait_for_timeout(500)
     dry_db = level_db(listen(page))
     assert np.all(dry_db < wet_db - 6)
+    # Two levels as well: a side that is heard changes at once, and the key goes to and fro.
+    levels = [each.get_attribute("value") for each in page.locator("#compare-b option").all()]
+    cheapest, best = levels[-2], page.input_value("#compare-a")
+    page.select_option("#compare-b", cheapest)
+    page.wait_for_function(f"nafir.state().level === '{cheapest}'")
+    page.keyboard.press("x")
+    page.wait_for_function(f"nafir.state().level === '{best}'")
+    page.keyboard.press("x")
+    page.wait_for_function(f"nafir.state().level === '{cheapest}'")
     page.click("#compare-stop")
     page.wait_for_function(f"!({is_dry})")
     assert page.inner_text("#compare-heard") == ""
