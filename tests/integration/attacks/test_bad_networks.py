@@ -24,7 +24,8 @@ class Heard:
     """What one listener heard: the sample clocks of its blocks, and how loud each was."""
 
     def __init__(self):
-        self.clocks, self.frames, self.peaks, self.reconnections = [], [], [], 0
+        self.clocks, self.frames, self.peaks = [], [], []
+        self.reconnections = self.resumptions = 0
 
     async def listen(self, address, until_s):
         loop = asyncio.get_running_loop()
@@ -38,7 +39,8 @@ class Heard:
                 if loop.time() > until_s:
                     break
             walking.cancel()
-            self.reconnections = stream.statistics.reconnections
+            counts = stream.statistics
+            self.reconnections, self.resumptions = counts.reconnections, counts.resumptions
         return self
 
     async def _walk(self, stream):
@@ -66,6 +68,7 @@ def test_bad_networks_harm_only_those_who_have_them_and_their_streams_go_on(addr
     assert all(each.reconnections >= len(CUT_AFTER_S) for each in heard[:LISTENERS])
     assert all(each.reconnections >= 1 for each in heard[LISTENERS:])
     for each in heard:
+        assert each.resumptions == each.reconnections
         # The clock of one stream, over all connections: nothing comes twice, and what is missing was silent.
         ends = np.add(each.clocks, each.frames)
         assert all(end <= begin for end, (_, begin) in zip(ends, pairwise(each.clocks), strict=False))
