@@ -31,8 +31,9 @@ SWEEP ?= --phases-of none --reuse-of factorised-r16
 MEASURE ?= --half report
 # How long each fuzzer runs, in seconds.
 FUZZ_SECONDS ?= 60
-# Folders with tests that watch the clock: collecting the others takes as long as many a test.
-TIMED := $(addprefix tests/,bench integration runtime streaming)
+# Files with tests that watch the clock: collecting all others takes as long as many a test.
+TIMED := $(shell grep -rl --include='test_*.py' 'mark\.timed' tests) \
+	$(shell grep -rL --include='test_*.py' '^pytestmark.*\.untimed' tests/integration)
 # What kernels, NumPy, OpenBLAS and torch are told, so that they compute as on a processor without AVX-512, and tests of
 # what they compute. ONNX Runtime asks the processor itself.
 AVX2 := NUMBA_CPU_NAME=znver2 NUMBA_CPU_FEATURES=+sse4.2,+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+popcnt \

@@ -49,9 +49,6 @@ bundle for which others of its folder would wait, if they came next."""
 _WAITING = ("page/", "integration/", "clients/", "api/", "soak/")
 """Files that take long as well, but wait: for browsers, for sound and for time to pass."""
 
-_TIMED = ("bench/", "integration/", "runtime/", "streaming/")
-"""Folders with `timed` tests: TIMED of the Makefile."""
-
 
 @pytest.hookimpl(tryfirst=True, optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int | None:
@@ -70,14 +67,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Raises UsageError for a `timed` test where `make test` would not look for it."""
-
     names = {path: path.relative_to(Path(__file__).parent).as_posix() for path in {item.path: None for item in items}}
-    for item in items:
-        if item.get_closest_marker("timed") and not names[item.path].startswith(_TIMED):
-            raise pytest.UsageError(
-                f"{item.nodeid} is timed: `make test` has to be told its folder, as has conftest.py"
-            )
     turn = {name: number for number, name in enumerate(in_turn(list(names.values())))}
     items.sort(key=lambda item: turn[names[item.path]])
 
