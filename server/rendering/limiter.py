@@ -17,7 +17,7 @@ if one does.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -115,6 +115,11 @@ class Limiter:
     def process(self, block: FloatArray) -> None:
         """Limit a block in place."""
         limit(self.state, block)
+
+
+ANY_LIMITER: Final[Reference] = Limiter(channels=1, block_size=_STEP, sample_rate=48_000).state
+"""Of no output: tells compiled code what a state is, also where there is no limiter. Compiled for both, everything that
+renders would be compiled twice."""
 
 
 @compiled

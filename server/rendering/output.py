@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from server.rendering.convolver import FloatArray
-from server.rendering.limiter import Limiter
+from server.rendering.limiter import ANY_LIMITER, Limiter
 from server.rendering.mixing import Mixer, mix
 from server.rendering.output_kernel import mixing_with, record_of
 
@@ -57,11 +57,10 @@ def mix_all(listeners: Sequence[tuple[Output, Sequence[Mixer], int]]) -> list[li
         blocks += count
         samples += count * output.sum.size
     like = next((mixer.direct_state for mixer in mixers if mixer.direct_state is not None), None)
-    limiter = next((output.limiter.state for output, _, _ in listeners if output.limiter is not None), None)
-    kinds = (None if each is None else each.kind for each in (like, limiter))
     # guard: a block is handed out as a copy
     frames, flags = np.empty(samples, np.float32), np.zeros((blocks, 2), np.int64)
-    mixing_with(*kinds)(np.array(rows, np.int64), frames, flags, like, limiter)
+    render = mixing_with(None if like is None else like.kind, ANY_LIMITER.kind)
+    render(np.array(rows, np.int64), frames, flags, like, ANY_LIMITER)
     for mixer in mixers:
         if mixer.convolver is not None:
             mixer.convolver.release()

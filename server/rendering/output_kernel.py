@@ -35,13 +35,13 @@ def mix_listeners(
     frames: npt.NDArray[np.float32],
     flags: npt.NDArray[np.int64],
     like: Reference | None,
-    like_limiter: Reference | None,
+    like_limiter: Reference,
 ) -> None:
     """Render the next blocks of every row, in order. A row (6,) holds: the address of an OUTPUT record, the addresses
     of two MIXER records (the second 0 for none), the number of blocks, the row of `flags` (block, 2) for the first
     block, and the index in `frames` at which it begins. The flags of a block say whether an IR was exchanged in it, and
-    whether it would have been too loud. `like` and `like_limiter` refer to any direct path's state and any limiter's
-    state, or are None if there is none."""
+    whether it would have been too loud. `like` refers to any direct path's state, or is None if there is none,
+    and `like_limiter` to any limiter's."""
     mode = flush_to_zero()
     for number in range(rows.shape[0]):
         output = carray(pointer(rows[number, 0]), (1,), OUTPUT)[0]
@@ -56,7 +56,7 @@ def mix_listeners(
                     _add(mixer, total)
                     if mixer.convolver != 0 and has_exchanged(mixer.convolver):
                         flags[block, 0] = 1
-            if like_limiter is not None and output.limiter != 0:
+            if output.limiter != 0:
                 limiter = reference_at(output.limiter, like_limiter)
                 limit(limiter, total)
                 flags[block, 1] = limiter.counts[0]
@@ -84,7 +84,7 @@ def _add(mixer, total) -> None:
 
 
 @cache
-def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Callable[..., None]:
+def mixing_with(kind: ReferenceType | None, limiter: ReferenceType) -> Callable[..., None]:
     """`mix_listeners` compiled for these types of reference. Calling it directly would let numba look up the types in
     Python at every call."""
     signature = (
@@ -92,7 +92,7 @@ def mixing_with(kind: ReferenceType | None, limiter: ReferenceType | None) -> Ca
         types.Array(types.float32, 1, "C"),
         types.Array(types.int64, 2, "C"),
         types.none if kind is None else kind,
-        types.none if limiter is None else limiter,
+        limiter,
     )
     return mix_listeners.compile(signature)  # type: ignore[attr-defined]
 

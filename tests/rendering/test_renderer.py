@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from server.rendering.fade import raised_cosine
+from server.rendering.limiter import ANY_LIMITER
 from server.rendering.output_kernel import mix_listeners
 from server.rendering.partitions import Partitioning
 from server.rendering.renderer import (
@@ -391,7 +392,7 @@ def test_rendering_leaves_the_interpreter_to_others():
     thread = threading.Thread(target=count)
     thread.start()
     before = len(counted)
-    mix_listeners(rows, frames, flags, None, None)
+    mix_listeners(rows, frames, flags, None, ANY_LIMITER)
     during = len(counted) - before
     counted.append(-1)
     thread.join()
