@@ -13,6 +13,7 @@ from server.acoustics.mesh_edges import Bends, bends_of
 from server.acoustics.mesh_paths_kernel import describe_mesh_paths, find_mesh_paths
 from server.acoustics.mesh_tree import MeshTree
 from server.acoustics.sound_path import DESCRIPTION, DescribedPaths, SoundPaths
+from server.kernels.copying import doubles
 
 
 class MeshPathFinder:
@@ -34,8 +35,8 @@ class MeshPathFinder:
         An emitter that no path reaches by any of the points of `Bends`, as in a closed cupboard, is hidden; its path is
         the straight line, at -100 dB in every band.
         """
-        listener = np.ascontiguousarray(listener, dtype=np.float64)
-        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        listener = doubles(listener)
+        emitters = doubles(emitters)
         paths = SoundPaths.empty(len(emitters)) if into is None else into
         find_mesh_paths(
             self._tree,
@@ -54,8 +55,8 @@ class MeshPathFinder:
 
     def describe(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> DescribedPaths:
         """Describe the paths to listeners (B, 3) from emitters (B, 3), by pairs."""
-        listeners = np.ascontiguousarray(listeners, dtype=np.float64)
-        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        listeners = doubles(listeners)
+        emitters = doubles(emitters)
         paths = DescribedPaths(np.empty(len(listeners)), np.empty((len(listeners), DESCRIPTION), np.float32))
         describe_mesh_paths(self._tree, self._bends, listeners, emitters, paths.length_m, paths.described)
         return paths

@@ -21,6 +21,7 @@ from server.acoustics.mesh_tree_kernel import (
     find_walls,
     join,
 )
+from server.kernels.copying import doubles
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int32]
@@ -95,7 +96,8 @@ class MeshTree:
                 raise ValueError(f"{name}: must be finite numbers")
         count = len(starts)
         hits = Hits(np.empty(count), np.empty(count, np.int32), np.empty(count, np.bool_))
-        limits = np.ascontiguousarray(np.broadcast_to(np.asarray(most, np.float64), count))
+        limits = np.empty(count)
+        limits[:] = most
         find_closest(self.tree, starts, ways, limits, hits.distance, hits.triangle, hits.faces)
         return hits
 
@@ -120,7 +122,7 @@ class MeshTree:
     def distance_m(self, points: Points) -> _Floats:
         """(...,) distance from each point to the nearest triangle."""
         places = np.asarray(points, dtype=np.float64)
-        flat = np.ascontiguousarray(places.reshape(-1, 3))
+        flat = doubles(places.reshape(-1, 3))
         distances = np.empty(len(flat))
         find_distances(self.tree, flat, distances)
         return distances.reshape(places.shape[:-1])

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from server.acoustics.decibels import power_to_db
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.reflections_kernel import find_first_echoes, find_reflections
+from server.kernels.copying import doubles
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -49,8 +50,7 @@ class FirstEcho:
 
     def length_m(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> Floats:
         """(n,) lower bounds of the path length for pairs of points (n, 3) inside the room."""
-        listeners = np.ascontiguousarray(listeners, dtype=np.float64)
-        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        listeners, emitters = doubles(listeners), doubles(emitters)
         length_m = np.empty(len(listeners))
         find_first_echoes(self._normals, self._offsets, listeners, emitters, length_m)
         return length_m

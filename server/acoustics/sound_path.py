@@ -15,6 +15,7 @@ import numpy.typing as npt
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path_kernel import describe_paths, find_sound_paths
+from server.kernels.copying import doubles
 
 Float32 = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -95,8 +96,8 @@ class PlanPathFinder:
 
         From a point outside the room, which no path reaches, sound travels straight through the walls.
         """
-        listener = np.ascontiguousarray(listener, dtype=np.float64)
-        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        listener = doubles(listener)
+        emitters = doubles(emitters)
         paths = SoundPaths.empty(len(emitters)) if into is None else into
         find_sound_paths(
             self._corners,
@@ -116,8 +117,8 @@ class PlanPathFinder:
 
     def describe(self, listeners: npt.ArrayLike, emitters: npt.ArrayLike) -> DescribedPaths:
         """Describe the paths to listeners (B, 3) from emitters (B, 3), by pairs."""
-        listeners = np.ascontiguousarray(listeners, dtype=np.float64)
-        emitters = np.ascontiguousarray(emitters, dtype=np.float64)
+        listeners = doubles(listeners)
+        emitters = doubles(emitters)
         paths = DescribedPaths(np.empty(len(listeners)), np.empty((len(listeners), DESCRIPTION), np.float32))
         describe_paths(
             self._corners,

@@ -113,8 +113,11 @@ class CompiledConvolver:
                 inputs.gain[0, at_once] = inputs.gain[1, at_once]
 
     def process(self, blocks: FloatArray, output: FloatArray) -> None:
-        if not process_block(self.address, blocks, output):
+        mix = output if output.flags.c_contiguous else np.empty(output.shape, np.float32)
+        if not process_block(self.address, np.ascontiguousarray(blocks), mix):
             raise ValueError(f"expected a block {self.input.shape} and room {self.output.shape} for the mix")
+        if mix is not output:
+            output[:] = mix
 
     def clear(self, source: int) -> None:
         self._wanted[source] = 0

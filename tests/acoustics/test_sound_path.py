@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.geometry import FloorPlan
 from server.acoustics.sound_path import DescribedPaths, PlanPathFinder, SoundPathFinder, SoundPaths
+from server.acoustics.sound_path_kernel import describe_paths, find_sound_paths
 from tests.oracles.sound_path import NumpySoundPathFinder, diffraction_gain_db
 
 Floats = npt.NDArray[np.float64]
@@ -48,6 +49,20 @@ PLANS = {"apartment": APARTMENT, "serpentine": SERPENTINE, "star": star(33), "bo
 FINDERS = {name: PlanPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
 FINDER = FINDERS["apartment"]
 ORACLES = {name: NumpySoundPathFinder(plan, SPEED_OF_SOUND) for name, plan in PLANS.items()}
+
+
+def test_places_that_are_read_only_or_lie_apart_compile_nothing_more():
+    """That would take seconds, on whichever thread asks first."""
+    kernels = (find_sound_paths, describe_paths)
+    before = [kernel.signatures for kernel in kernels]
+    places = np.array([[3.0, 0.0, 3.0, 0.0, 1.5, 0.0], [5.0, 0.0, 3.0, 0.0, 1.5, 0.0]])
+    expected = FINDER.find(places[0, ::2].copy(), places[:, ::2].copy())
+    places.flags.writeable = False
+    for each in (places[:, ::2], np.ascontiguousarray(places[:, ::2])):
+        each.flags.writeable = False
+        np.testing.assert_array_equal(FINDER.find(each[0], each).length_m, expected.length_m)
+        FINDER.describe(each, each)
+    assert [kernel.signatures for kernel in kernels] == before
 
 
 def points_inside(plan: FloorPlan, count: int, seed: int, *, clearance_m: float = 0.0) -> Floats:

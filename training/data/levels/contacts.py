@@ -67,6 +67,7 @@ def find_contacts(corners: _Floats, triangles: _Integers, cells: Cells) -> Conta
     low, high = corners.min(axis=1), corners.max(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    triangles = np.ascontiguousarray(triangles)
     pairs, kinds, is_whole = _meet(
         corners, low, high, normals, triangles, cells.origin_m, cells.size_m, cells.shape, cells.starts, cells.held,
         MOST_PAIRS,

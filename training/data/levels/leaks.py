@@ -40,7 +40,7 @@ def escaping(corners: _Floats, origins: _Floats, leaves: Sequence[_Floats], rng:
 
     Triangles are `corners` (T, 3, 3) and those of the shut doors' leaves.
     """
-    everything = np.concatenate([corners, *leaves])
+    everything = np.concatenate([corners, *leaves], dtype=np.float64)
     cells = cells_of(everything)
     directions = _sphere(_RAYS)
     starts = np.repeat(origins, _RAYS, axis=0)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from server.kernels.compiled import compiled
+from server.kernels.copying import doubles
 
 _Floats = npt.NDArray[np.float64]
 _Integers = npt.NDArray[np.int64]
@@ -61,6 +62,7 @@ class Space:
         """(T, 4) crossings of each triangle of `corners` (T, 3, 3) at which air (region,) is only before it, only
         behind it, on both sides, and on neither. Triangles between the grid's lines have none."""
         found = np.zeros((len(corners), 4), np.int64)
+        corners = doubles(corners)
         for axis in range(3):
             _count_sides(corners, self.origin_m, self.step_m, self.region, axis, is_air, found)
         return found
@@ -68,6 +70,7 @@ class Space:
 
 def sample_space(corners: _Floats) -> Space:
     """The space around triangles `corners` (T, 3, 3)."""
+    corners = doubles(corners)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     size = high - low
     step = _FINEST_STEP_M
