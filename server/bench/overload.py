@@ -5,7 +5,8 @@ break somebody's sound is asked for three times as many streams in the same mome
 
 - `admitted`: streams that were let in at once and hear all their emitters. The others come back when they were told to,
   and `admitted_later` of them are let in within half a minute. Of the blocks of all these fewer than one in a thousand
-  may be late, and none may step down to a cheaper quality.
+  may be late, and none may step down to a cheaper quality. `blocks_late` came late, `blocks_dropped` had no room among
+  those that a client had not acknowledged, and `blocks_missing` were never made.
 - `refused`: everybody else has to be told within a second when to come back. `answer_s` is the longest time from when a
   client began to connect until it was let in or refused, `refusal_s` of those refused, `median_answer_s` the median.
 - `client_stall_s`: the longest time for which the clients, which share one thread, did not get to read: so much of
@@ -93,6 +94,7 @@ async def _overload(port: int, crowd: Crowd, asked: int, duration_s: float) -> d
             "least_retry_s": min((walker.retry_after_s or 0 for walker in refused), default=None),
             "most_retry_s": max((walker.retry_after_s or 0 for walker in refused), default=None),
             "late_share": min(1.0, sum(map(count_late, both)) / due) if due else 1.0,
+            **{name: sum(each[name] for each in both) for name in ("blocks_late", "blocks_dropped", "blocks_missing")},
             "steps_down": told["nafir_level_steps_total", "load"],
             "quality_at_end": report["quality_at_end"],
             "refused_for": {

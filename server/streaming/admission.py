@@ -30,6 +30,7 @@ from server.streaming.headroom import (
     StreamCost,
     StreamKind,
     ThreadLoad,
+    blocks_for_waits,
     blocks_needed,
     expected_cost,
     fits_on_top,
@@ -41,6 +42,8 @@ from server.streaming.headroom import (
     saving,
     seconds_to_next_ending,
     spare_cores,
+    spare_for_irs,
+    taken_elsewhere,
 )
 from server.streaming.load_policy import patience_s
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
@@ -171,11 +174,15 @@ class Admission:
             spare_cores=float(cores),
             most_ahead_s=limits.most_opening_s,
             patience_s=limits.turn_patience_s,
-            is_behind=lambda: engine.has_first_work_waiting,
+            is_behind=lambda: engine.has_first_work_waiting or self._longest_wait > limits.full_waits,
             call_later=call_later,
             time_s=time_s,
         )
         self._measured_s, self._measured_cpu_s = time_s(), 0.0
+        self._longest_wait, self._waited_s = 0.0, -math.inf
+        """The longest wait for responses of the last second, as a share of patience, and when it was seen."""
+        self._elsewhere = 0.0
+        """Cores that workers do not get, of those that streams leave."""
 
     @property
     def streams(self) -> int:
@@ -206,6 +213,8 @@ class Admission:
             # The event loop does other work too, so blocks take no more than what it took when it took least.
             seen_s = cpu_passed_s / passed_s / blocks_hz
             self._block_sent_s = min(seen_s, 1.01 * self._block_sent_s)
+        self._note_waits(now_s)
+        self._note_pace()
         self._learn(now_s)
         load = self.load()
         self.headroom = headroom(self._limits, self._thresholds, load)
@@ -213,10 +222,26 @@ class Admission:
         self._beginnings.spare_cores = spare_cores(self._limits, self._thresholds, self._load_now())
         left = self.spare_cores - load.demand - load.eased_demand
         self.background_share = max(self._limits.least_background, left / 2) if load.streams else math.inf
-        self._announce(load)
+        for_waits = self._announce(load)
         has_room = not self._is_on or load.streams <= 1 or self._may_rise(load, now_s)
+        begins = self._is_on and (self._beginnings.done_in_s > 0 or self._beginnings.turn_in_s > 0)
         for thread in self._engine.threads:
             thread.has_room_on_top, thread.others_wait = has_room, self._is_on and self._others_wait(now_s)
+            thread.others_begin = begins
+            thread.spare_cores = spare_for_irs(self._limits, self._thresholds, load, least=for_waits)
+
+    def _note_waits(self, now_s: float) -> None:
+        """Note how long streams have waited for responses lately, as a share of their patience."""
+        longest = max((thread.longest_wait for thread in self._engine.threads if thread.busy_share), default=0.0)
+        if longest >= self._longest_wait or now_s - self._waited_s > self._limits.full_waits_s:
+            self._longest_wait, self._waited_s = longest, now_s
+
+    def _note_pace(self) -> None:
+        """Note what workers get of a core while they compute responses, and what others have of it."""
+        paces = [thread.worker_pace for thread in self._engine.threads if thread.busy_share]
+        alone = replace(self._load_now(), elsewhere=0.0)
+        pace = sum(paces) / len(paces) if paces else 1.0
+        self._elsewhere = taken_elsewhere(self._limits, self._thresholds, alone, pace)
 
     def _others_wait(self, now_s: float) -> bool:
         """Return whether clients that were refused are still to come back."""
@@ -239,6 +264,8 @@ class Admission:
             workers=self._engine.workers,
             opening_s=self._beginnings.done_in_s,
             turn_in_s=self._beginnings.turn_in_s,
+            longest_wait=self._longest_wait,
+            elsewhere=self._elsewhere,
             most_streams=self._most_streams,
         )
         return alone.plus_all(
@@ -582,15 +609,18 @@ class Admission:
         saved = saving(self._limits, thread.blocks_at_once)
         return ThreadLoad(ahead=max(0.0, thread.mean_busy - sum(stream.load for stream in streams)) / saved)
 
-    def _announce(self, load: ServerLoad) -> None:
-        """Have each thread render as many blocks at once as it will need for those who come."""
+    def _announce(self, load: ServerLoad) -> int:
+        """Have each thread render as many blocks at once as it will need for those who come, and for IRs to be in time;
+        return as many as the latter takes."""
+        for_waits = blocks_for_waits(self._limits, self._thresholds, load)
         for number, thread in enumerate(self._engine.threads):
             is_expecting = any(
                 place.until_s > self._time_s() and place.thread == number and place.kind is not None
                 for place in self._places
             )
             needed = blocks_needed(self._limits, self._thresholds, load.threads[number]) if is_expecting else 1
-            thread.least_blocks = needed if self._is_on else 1
+            thread.least_blocks = max(needed, for_waits) if self._is_on else 1
+        return for_waits if self._is_on else 1
 
     def _learn(self, now_s: float) -> None:
         """Correct what streams of each kind are expected to cost by what they do cost."""

@@ -56,6 +56,8 @@ from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from server.streaming.stream_times import ResponseWait, StreamTimes
 
+COST_SMOOTHING = 0.2
+"""Weight of the newest of costs in their mean."""
 _MOST_NUMBER = 255
 """The number of a listener has a byte in the header of blocks."""
 
@@ -80,6 +82,9 @@ class Member:
     wait: ResponseWait = field(default_factory=ResponseWait)
     request_s: float = 0.0
     """The smoothed CPU time of a request for IRs; 0 before the first answer."""
+    has_only_begun: bool = True
+    """Whether all answers so far had first IRs of emitters, of which no part was kept: they say nothing of those that
+    follow."""
     wants_turn: bool = False
     """Whether it waits for its turn to request IRs."""
     asked_last_s: float = -math.inf
@@ -97,6 +102,12 @@ class Member:
     def is_unanswered(self) -> bool:
         """Whether a request for IRs is unanswered."""
         return self.has_asked and not self.is_answered
+
+    def note_request(self, cpu_s: float, *, is_first: bool) -> None:
+        """Note the CPU time of a request for IRs, which had first IRs of emitters or not."""
+        weight = 1.0 if self.has_only_begun else COST_SMOOTHING
+        self.request_s += weight * (cpu_s - self.request_s)
+        self.has_only_begun = self.has_only_begun and is_first
 
     def count(self) -> Counter[str]:
         """What has been counted of its blocks."""

@@ -52,7 +52,15 @@ from server.runtime.thread_watch import Watched
 from server.runtime.workers import Workers
 from server.streaming.balance import BalanceState, ThreadLoad, balance
 from server.streaming.headroom import LIMITS, saving
-from server.streaming.load_policy import LoadState, Measurement, RenderAhead, ThreadState, decide, requests_at_once
+from server.streaming.load_policy import (
+    LoadState,
+    Measurement,
+    RenderAhead,
+    ThreadState,
+    decide,
+    longest_wait,
+    requests_at_once,
+)
 from server.streaming.load_thresholds import THRESHOLDS, Thresholds
 from server.streaming.request_queue import RequestQueue
 from server.streaming.stream import Outgoing, Stream, StreamFailed
@@ -301,6 +309,15 @@ class AudioThread:
         """Whether a stream may step up to the top of its ladder. Any thread may set it."""
         self.others_wait = False
         """Whether others wait to be let in. Any thread may set it."""
+        self.others_begin = False
+        """Whether newcomers begin. Any thread may set it."""
+        self.worker_pace = 1.0
+        """Share of a core that a worker got lately while it computed IRs for its streams. Any thread may read it."""
+        self.spare_cores = math.inf
+        """Cores that are left to the IRs of its streams. Any thread may set it."""
+        self.longest_wait = 0.0
+        """The longest wait for IRs of the last period, as a share of the patience of the stream that waited. Any thread
+        may read it."""
         self.least_blocks = 1
         """Least number of blocks at once, for newcomers whose work is still to come. Any thread may set it."""
         self._looked_s = time_s()
@@ -505,13 +522,23 @@ class AudioThread:
         self._looked_s = now_s
         self.mean_busy += self._thresholds.newest_weight * (busy - self.mean_busy)
         saved, kept = saving(LIMITS, self.blocks_at_once), math.exp(-period_s / LIMITS.memory_s)
-        for stream in self._streams:
-            stream.note_cost(period_s=period_s, saving=saved, memory=kept)
+        requested = [stream.note_cost(period_s=period_s, saving=saved, memory=kept) for stream in self._streams]
+        if duration_s := sum(each.duration_s for each in requested):
+            pace = min(1.0, sum(each.cpu_s for each in requested) / duration_s)
+            self.worker_pace += self._thresholds.newest_weight * (pace - self.worker_pace)
         state = LoadState(self._load, {stream: stream.ladder for stream in self._streams})
         samples = {stream: stream.sample_load(now_s) for stream in self._streams}
         measurement = Measurement(
-            now_s, busy, samples, self.least_blocks, self.has_room_on_top, others_wait=self.others_wait
+            now_s,
+            busy,
+            samples,
+            self.least_blocks,
+            self.has_room_on_top,
+            others_wait=self.others_wait,
+            others_begin=self.others_begin,
+            spare_cores=self.spare_cores,
         )
+        self.longest_wait = longest_wait(self._thresholds, state, measurement)
         state, decision = decide(self._thresholds, state, measurement)
         self._load = state.thread
         for stream, ladder in state.ladders.items():

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from server.rendering.convolver import Sharing
 from server.streaming.load_policy import ir_share, patience_s
 from server.streaming.load_thresholds import Thresholds
 from server.streaming.quality_steps import QualityStep
@@ -49,18 +50,27 @@ class Limits:
     full_workers: float = 0.5
     """Share of the time left for IRs that streams on top of their ladders may ask for together for waits to be short.
     Beyond it, each waits for one request of all others in turn."""
+    full_waits: float = 1.0
+    """Longest wait for IRs, as a share of patience, up to which newcomers are let in, whatever is expected of them."""
+    full_waits_s: float = 1.0
+    """Seconds for which such a wait counts."""
+    for_newcomers: float = 0.9
+    """Share of all that streams may take together up to which newcomers are let in. The rest is for what those who are
+    there ask for more, and for what the host takes."""
     most_opening_s: float = 0.05
     """Seconds that newcomers may still take to begin when the next one does. Their first IRs go before all others, and
     two periods of the load policy with long waits are one too many."""
-    most_turn_s: float = 0.35
+    most_turn_s: float = 0.55
     """Seconds after which a newcomer's turn to begin has to be expected. Who is refused is to know within a second."""
-    turn_patience_s: float = 0.45
+    turn_patience_s: float = 0.65
     """Seconds after which a newcomer is refused whose turn has not come."""
 
     poses_hz: float = 30.0
     """Poses per second that a newcomer is expected to send, and with that the IRs that it asks for at its best."""
     block_sent_s: float = 40e-6
     """CPU seconds of the event loop for a block, until the server has measured its own."""
+    least_request_s: float = 0.4e-3
+    """CPU seconds that a request for IRs takes at least, however few have changed."""
     begin_s: float = 8e-3
     """CPU seconds that a newcomer's beginning takes beside its emitters: a session, a plan of effects, messages."""
     begin_emitter_s: float = 0.5e-3
@@ -100,15 +110,22 @@ LEAST_PACE: Final = 0.1
 
 @dataclass(frozen=True)
 class RenderCost:
-    """CPU seconds to render: a block of a stream, and of each of its emitters, and the exchange of one IR."""
+    """CPU seconds to render: a block of a stream, and of each of its emitters, and the exchange of one IR. `response_s`
+    is what an IR takes in a request for those of several emitters, if that was measured, and `early_share` the share of
+    it where the later part is kept."""
 
     block_s: float
     emitter_s: float
     exchange_s: float
+    response_s: float | None = None
+    early_share: float = 1.0
+    sharing: Sharing = Sharing.NOTHING
+    """What the emitters shared."""
 
-    def share(self, *, emitters: int, rate_hz: float, block_s: float) -> float:
-        """Return the share of a core for blocks of `block_s`, with `rate_hz` IRs per second and emitter."""
-        return (self.block_s + emitters * self.emitter_s) / block_s + emitters * rate_hz * self.exchange_s
+    def share(self, *, emitters: int, rate_hz: float, block_s: float, shared: float = 1.0) -> float:
+        """Return the share of a core for blocks of `block_s`, with `rate_hz` IRs per second and emitter. An emitter
+        takes the part `shared` of what it does otherwise."""
+        return (self.block_s + emitters * self.emitter_s * shared) / block_s + emitters * rate_hz * self.exchange_s
 
 
 @dataclass(frozen=True)
@@ -171,9 +188,18 @@ def expected_cost(
     """Return what a stream of a kind is expected to take on a quality step, while its listeners walk: each of them
     takes as much as a stream of its own would."""
     rate_hz = limits.poses_hz if step.ir_rate_hz is None else min(limits.poses_hz, step.ir_rate_hz)
-    share = kind.render[step.level].share(emitters=emitters, rate_hz=rate_hz, block_s=kind.block_s)
-    new_s = listeners * emitters * step.cost_ms / 1000
-    request_s = new_s * kind.walk.get(step.level, 1.0) * correction.requests
+    cost = kind.render[step.level]
+    shared = thresholds.rendering_by_sharing[step.sharing] / thresholds.rendering_by_sharing[cost.sharing]
+    share = cost.share(emitters=emitters, rate_hz=rate_hz, block_s=kind.block_s, shared=min(1.0, shared))
+    new_s = listeners * emitters * (step.cost_ms / 1000 if cost.response_s is None else cost.response_s)
+    # On a full server requests are few, and so more of what was kept is too far away.
+    walk = kind.walk.get(step.level, 1.0)
+    walk = walk if is_top else min(1.0, walk * limits.poses_hz / thresholds.least_ir_rate_hz)
+    request_s = new_s * walk * correction.requests
+    if step.late_reach_m > 0:
+        whole = min(1.0, thresholds.whole_at_once / emitters)
+        request_s *= whole + (1 - whole) * cost.early_share
+    request_s = max(limits.least_request_s * listeners, request_s)
     return StreamCost(
         rendering=listeners * share * correction.rendering,
         loop=listeners * (limits.block_sent_s if block_sent_s is None else block_sent_s) / kind.block_s,
@@ -211,7 +237,8 @@ class ServerLoad:
     for IRs, `round_s` the CPU time of one request of each, and `patience_s` the least of their patiences; of those
     below, `eased_demand` is the share of a core and `eased_round_s` the CPU time of one request of each. `opening_s` is
     how long those that begin are still likely to be at it, and `turn_in_s` when whoever comes now is likely to have its
-    turn. `encoding` is the share of a core of all encoders."""
+    turn. `encoding` is the share of a core of all encoders. `longest_wait` is the longest that somebody waited for IRs
+    lately, as a share of its patience. Of what streams leave, `elsewhere` are the cores that workers do not get."""
 
     threads: tuple[ThreadLoad, ...]
     cores: int
@@ -225,6 +252,8 @@ class ServerLoad:
     eased_round_s: float = 0.0
     opening_s: float = 0.0
     turn_in_s: float = 0.0
+    longest_wait: float = 0.0
+    elsewhere: float = 0.0
     most_streams: int = 1
 
     @property
@@ -290,10 +319,37 @@ def blocks_needed(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) ->
     return most
 
 
-def spare_cores(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
-    """Return the cores that audio threads, encoders, the event loop and plans of effects leave to everything else."""
-    threads = sum(_settled(limits, thresholds, thread) for thread in load.threads)
+def blocks_for_waits(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> int:
+    """Return at how many blocks at once the threads leave time enough for IRs; the most if they never do. Poses are
+    heard later before reverberation lags."""
+    *fewer, most = thresholds.blocks_at_once
+    return next(
+        (
+            blocks
+            for blocks in fewer
+            if _waits_are_short(limits, thresholds, load, least=blocks, part=limits.for_newcomers)
+            and _turns_are_soon(limits, thresholds, load, least=blocks, part=limits.for_newcomers)
+        ),
+        most,
+    )
+
+
+def spare_cores(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, least: int = 1) -> float:
+    """Return the cores that audio threads, encoders, the event loop and plans of effects leave to everything else.
+    Each thread renders at `least` so many blocks at once."""
+    threads = sum(_settled(limits, thresholds, thread, least) for thread in load.threads)
     return max(0.0, load.cores - threads - load.encoding - load.loop - _plans(thresholds, load))
+
+
+def taken_elsewhere(limits: Limits, thresholds: Thresholds, load: ServerLoad, pace: float) -> float:
+    """Return the cores that workers should get by what streams take but do not, since each gets the share `pace` of a
+    core while it computes: other programs have them, or the interpreter's lock."""
+    return max(0.0, min(float(load.workers), spare_cores(limits, thresholds, load)) - pace * load.workers)
+
+
+def spare_for_irs(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, least: int = 1) -> float:
+    """Return the cores that are left to the IRs of each thread with streams."""
+    return _spare(limits, thresholds, load, least) / max(1, sum(thread.streams > 0 for thread in load.threads))
 
 
 def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
@@ -303,7 +359,9 @@ def obstacle(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: i
         return "streams"
     if load.streams == 0:
         return None
-    found = _scarce(limits, thresholds, load.plus(thread, cost), thread, cost)
+    found = _scarce(limits, thresholds, load.plus(thread, cost), thread, cost, part=limits.for_newcomers)
+    if found is None and load.longest_wait > limits.full_waits:
+        return "responses"
     if found is None and cost.opening_s and load.turn_in_s > limits.most_turn_s:
         return "opening"
     return found
@@ -326,27 +384,43 @@ def obstacle_to_change(
     return found
 
 
-def _scarce(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost) -> Scarce | None:
-    """Return what there is too little of under a load that includes the newcomer's `cost`."""
-    if busy(limits, load.threads[thread], thresholds.blocks_at_once[-1]) > limits.full_rendering:
+def _scarce(
+    limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: int, cost: StreamCost, *, part: float = 1.0
+) -> Scarce | None:
+    """Return what there is too little of under a load that includes the newcomer's `cost`, and that may take a `part`
+    of what there is."""
+    if busy(limits, load.threads[thread], thresholds.blocks_at_once[-1]) > part * limits.full_rendering:
         return "rendering"
-    if load.loop > limits.full_loop:
+    if load.loop > part * limits.full_loop:
         return "event_loop"
-    if _cores_needed(limits, thresholds, load) > limits.full_cores * load.cores:
+    if _cores_needed(limits, thresholds, load) > part * limits.full_cores * load.cores:
         return "cores"
     if cost.request_s == 0:
         return None
-    spare = min(float(load.workers), spare_cores(limits, thresholds, load))
-    if not _waits_are_short(limits, thresholds, load, spare):
-        return "responses"
+    most = thresholds.blocks_at_once[-1]
+    is_served = _waits_are_short(limits, thresholds, load, least=most)
+    is_served = is_served and _turns_are_soon(limits, thresholds, load, least=most, part=part)
     if cost.is_top:
         # It keeps its step when the server is full.
-        is_lasting = _waits_are_short(limits, thresholds, load, min(spare, _spare_when_full(limits, thresholds, load)))
+        is_lasting = _keeps_top(limits, thresholds, load)
     else:
-        share = ir_share(thresholds, busy=_settled(limits, thresholds, load.threads[thread]))
-        interval_s = cost.request_s * load.threads[thread].streams / share
-        is_lasting = interval_s <= 1 / thresholds.least_ir_rate_hz
-    return None if is_lasting else "responses"
+        share = _ir_share(limits, thresholds, load, load.threads[thread], most)
+        is_lasting = cost.request_s * load.threads[thread].streams * thresholds.least_ir_rate_hz <= part * share
+    return None if is_served and is_lasting else "responses"
+
+
+def _turns_are_soon(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, least: int, part: float = 1.0) -> bool:
+    """Return whether streams below the top of their ladders, which take turns, get as many IRs as the lowest step has
+    in a `part` of the time for IRs, where threads render at `least` so many blocks at once."""
+    shared = sum(_ir_share(limits, thresholds, load, thread, least) for thread in load.threads if thread.streams)
+    return load.eased_round_s * thresholds.least_ir_rate_hz <= part * shared
+
+
+def _ir_share(limits: Limits, thresholds: Thresholds, load: ServerLoad, thread: ThreadLoad, least: int) -> float:
+    """Return the share of a core for IRs of the streams of a thread, where threads render at `least` so many blocks at
+    once."""
+    spare = spare_for_irs(limits, thresholds, load, least=least)
+    return ir_share(thresholds, busy=_settled(limits, thresholds, thread, least), spare_cores=spare)
 
 
 def fits_on_top(
@@ -368,19 +442,36 @@ def fits_on_top(
     most_s = limits.full_patience * risen.patience_s * spare
     if round_s > most_s and demand > limits.full_workers * spare:
         return False
-    return _waits_are_short(limits, thresholds, risen, min(spare, _spare_when_full(limits, thresholds, load)))
+    return _waits_are_short(limits, thresholds, risen) and _keeps_top(limits, thresholds, risen, grows=False)
 
 
-def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) -> float:
-    """Return the busy share of a thread at the blocks at once that it comes to."""
-    return busy(limits, thread, blocks_needed(limits, thresholds, thread))
+def _settled(limits: Limits, thresholds: Thresholds, thread: ThreadLoad, least: int = 1) -> float:
+    """Return the busy share of a thread at the blocks at once that it comes to, or at `least` so many."""
+    return busy(limits, thread, max(least, blocks_needed(limits, thresholds, thread)))
 
 
-def _spare_when_full(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> float:
-    """Return the cores that are left when the audio threads render as much as they may."""
-    others = load.encoding + load.loop
+def _spare(limits: Limits, thresholds: Thresholds, load: ServerLoad, least: int = 1) -> float:
+    """Return the cores that workers get."""
+    return max(0.0, min(float(load.workers), spare_cores(limits, thresholds, load, least=least)) - load.elsewhere)
+
+
+def _spare_when_full(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, grows: bool) -> float:
+    """Return the cores that are left when the audio threads render as much as they may, and what sends their blocks
+    `grows` with that."""
+    most = thresholds.blocks_at_once[-1]
+    now = sum(busy(limits, thread, most) for thread in load.threads)
+    growth = max(1.0, limits.full_rendering * len(load.threads) / now) if now and grows else 1.0
+    others = growth * (load.encoding + load.loop)
     rendering = min(limits.full_rendering * len(load.threads), limits.full_cores * load.cores - others)
     return max(0.0, load.cores - rendering - others - _plans(thresholds, load))
+
+
+def _keeps_top(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, grows: bool = True) -> bool:
+    """Return whether streams on top of their ladders could stay there when the server is full, with others below. What
+    sends blocks `grows` until then."""
+    least = thresholds.ir_share * thresholds.least_ir_share * len(load.threads)
+    spare = min(_spare(limits, thresholds, load), _spare_when_full(limits, thresholds, load, grows=grows))
+    return _are_served(limits, load, spare - least)
 
 
 def _plans(thresholds: Thresholds, load: ServerLoad) -> float:
@@ -388,18 +479,25 @@ def _plans(thresholds: Thresholds, load: ServerLoad) -> float:
     return thresholds.plan_share * sum(thread.streams > 0 for thread in load.threads)
 
 
-def _waits_are_short(limits: Limits, thresholds: Thresholds, load: ServerLoad, spare: float) -> bool:
-    """Return whether streams on top of their ladders get their IRs in time from so many `spare` cores, of which those
-    below have their share. If there is time for all requests, a stream waits for little more than its own; if not, for
-    one of each stream in turn."""
-    if not load.round_s:
-        return True
+def _waits_are_short(
+    limits: Limits, thresholds: Thresholds, load: ServerLoad, *, least: int = 1, part: float = 1.0
+) -> bool:
+    """Return whether streams on top of their ladders get their IRs in time from a `part` of the cores that threads
+    leave at `least` so many blocks at once, of which those below have their share."""
     shared = sum(
-        ir_share(thresholds, busy=_settled(limits, thresholds, thread)) for thread in load.threads if thread.streams
+        ir_share(thresholds, busy=_settled(limits, thresholds, thread, least))
+        for thread in load.threads
+        if thread.streams
     )
-    left = spare - min(load.eased_demand, shared)
+    spare = part * _spare(limits, thresholds, load, least)
+    return _are_served(limits, load, spare - min(load.eased_demand, shared))
+
+
+def _are_served(limits: Limits, load: ServerLoad, left: float) -> bool:
+    """Return whether streams on top of their ladders get their IRs in time from so many cores that are `left`. If there
+    is time for all requests, a stream waits for little more than its own; if not, for one of each stream in turn."""
     if left <= 0:
-        return False
+        return not load.round_s
     most_s = limits.full_patience * load.patience_s * left
     return load.round_s <= most_s or load.demand <= limits.full_workers * left
 

@@ -54,8 +54,10 @@ class LoadSample:
 class Measurement(Generic[Key]):
     """The load of an audio thread in the period that ended at `now_s`; it rendered for the share `busy` of it.
     `least_blocks` is the least number of blocks at once, for newcomers whose work is still to come. Unless it
-    `has_room_on_top`, no stream steps up to the top of its ladder, from where it asks for IRs as often as it likes.
-    While `others_wait` to be let in, none steps up above the step on which it was let in itself."""
+    `has_room_on_top`, no stream steps up to the top of its ladder, from where it asks for IRs as often as it likes, but
+    those that were let in there. While `others_wait` to be let in, none steps up above the step on which it was let in
+    itself. While `others_begin`, whose first IRs go before all others, waits for IRs say nothing of the streams that
+    are there. `spare_cores` are left to the IRs of its streams by everything else."""
 
     now_s: float
     busy: float
@@ -63,6 +65,8 @@ class Measurement(Generic[Key]):
     least_blocks: int = 1
     has_room_on_top: bool = True
     others_wait: bool = False
+    others_begin: bool = False
+    spare_cores: float = math.inf
 
     @property
     def lateness(self) -> float:
@@ -154,6 +158,13 @@ class ThreadState:
     """When the thread last made streams step down because it had too much to do."""
     changed_s: float = -math.inf
     """When the number of blocks at once last changed or streams last stepped down: waits for IRs change with both."""
+    begun_s: float = -math.inf
+    """When newcomers were last seen to begin."""
+
+    @property
+    def waits_since_s(self) -> float:
+        """Since when waits for IRs show whether there is time for those of all streams."""
+        return max(self.changed_s, self.begun_s)
 
     @property
     def restarted(self) -> "ThreadState":
@@ -191,11 +202,11 @@ def decide(
     can_make_time = state.thread.ahead.blocks < thresholds.blocks_at_once[-1]
     thread = _judge_thread(thresholds, state.thread, measurement, can_make_time=can_make_time)
     ladders = {
-        key: _judge_stream(thresholds, state.ladders[key], sample, measurement.now_s, changed_s=thread.changed_s)
+        key: _judge_stream(thresholds, state.ladders[key], sample, measurement.now_s, since_s=thread.waits_since_s)
         for key, sample in measurement.streams.items()
     }
     thread, ladders, moved = _move(thresholds, thread, ladders, measurement)
-    share = ir_share(thresholds, busy=measurement.busy)
+    share = ir_share(thresholds, busy=measurement.busy, spare_cores=measurement.spare_cores)
     streams = len(measurement.streams)
     decision = Decision(
         thread.ahead.blocks,
@@ -268,11 +279,12 @@ def _average(thresholds: Thresholds, ahead: RenderAhead, busy: float) -> RenderA
     )
 
 
-def ir_share(thresholds: Thresholds, *, busy: float) -> float:
-    """Return the share of a core for IRs of the streams of an audio thread that renders for a share `busy` of the
-    time."""
+def ir_share(thresholds: Thresholds, *, busy: float, spare_cores: float = math.inf) -> float:
+    """Return the share of a core for IRs of the streams of an audio thread that renders for a share `busy` of the time,
+    where all else leaves `spare_cores`."""
     most = thresholds.ir_share
-    return min(most, max(thresholds.shared_core - busy, thresholds.least_ir_share * most))
+    left = min(thresholds.shared_core - busy, thresholds.used_of_spare * spare_cores)
+    return min(most, max(left, thresholds.least_ir_share * most))
 
 
 def ir_interval_s(ladder: Ladder, *, request_s: float, streams: int, share: float) -> float:
@@ -293,6 +305,19 @@ def patience_s(thresholds: Thresholds, step: QualityStep) -> float:
     if step.ir_rate_hz is None:
         return thresholds.patience_s
     return max(thresholds.patience_s, thresholds.patience_intervals / step.ir_rate_hz)
+
+
+def longest_wait(thresholds: Thresholds, state: LoadState[Key], measurement: Measurement[Key]) -> float:
+    """Return the longest wait for IRs as a share of the patience of the stream that waits. Streams whose step is not in
+    effect yet do not count."""
+    return max(
+        (
+            (sample.ir_wait_s or 0.0) / patience_s(thresholds, state.ladders[key].step)
+            for key, sample in measurement.streams.items()
+            if sample.is_in_effect
+        ),
+        default=0.0,
+    )
 
 
 def _judge_thread(
@@ -318,14 +343,15 @@ def _judge_thread(
         lateness=lateness,
         catches_up=catches_up,
         changed_s=thread.changed_s if ahead.blocks == thread.ahead.blocks else measurement.now_s,
+        begun_s=measurement.now_s if measurement.others_begin else thread.begun_s,
         overloaded_periods=thread.overloaded_periods + 1 if is_overloaded else 0,
         well_since_s=_since(thread.well_since_s, measurement.now_s, is_so=is_well),
     )
 
 
 def _new_wait_s(thresholds: Thresholds, wait_s: float, since_s: float) -> float:
-    """Return for how long a stream has waited for IRs since the last change of what its thread gives up, which was
-    `since_s` seconds ago. A wait from before says nothing of it, unless it goes on for long."""
+    """Return for how long a stream has waited for IRs since what its thread gives up last changed, or newcomers last
+    began, which was `since_s` seconds ago. A wait from before says nothing of it, unless it goes on for long."""
     return min(wait_s, since_s) if wait_s <= since_s or since_s > thresholds.stale_wait_s else 0.0
 
 
@@ -338,11 +364,11 @@ def _with_most_blocks(thresholds: Thresholds, busy: float, blocks: int) -> float
 
 
 def _judge_stream(
-    thresholds: Thresholds, ladder: Ladder, sample: LoadSample, now_s: float, *, changed_s: float
+    thresholds: Thresholds, ladder: Ladder, sample: LoadSample, now_s: float, *, since_s: float
 ) -> Ladder:
-    """Return a stream's ladder after the measurement of how long it waits for IRs, on a thread that last changed at
-    `changed_s`."""
-    wait_s = _new_wait_s(thresholds, sample.ir_wait_s or 0.0, now_s - changed_s)
+    """Return a stream's ladder after the measurement of how long it waits for IRs, on a thread where waits show
+    something `since_s`."""
+    wait_s = _new_wait_s(thresholds, sample.ir_wait_s or 0.0, now_s - since_s)
     # IRs of another level are all computed anew: how long that takes says nothing of the waits that follow.
     is_overloaded = sample.is_in_effect and wait_s > patience_s(thresholds, ladder.step)
     expected_s = wait_s * ladder.above.cost_ms / ladder.step.cost_ms
@@ -376,7 +402,8 @@ def _move(
             ladders[key] = _lowered(thresholds, ladders[key], now_s)
             moved[key] = "load"
 
-    if now_s - thread.changed_s >= thresholds.settle_s and (slow := _slowest(thresholds, thread, ladders, measurement)):
+    has_settled = now_s - thread.waits_since_s >= thresholds.settle_s
+    if has_settled and (slow := _slowest(thresholds, thread, ladders, measurement)):
         for key in slow:
             lower(key)
         # The others wait in the same queue: whether that was enough, only new waits can tell.
@@ -395,7 +422,7 @@ def _move(
         key
         for key, ladder in ladders.items()
         if _may_rise(thresholds, thread, ladder, now_s)
-        and (measurement.has_room_on_top or ladder.at > 1)
+        and (measurement.has_room_on_top or ladder.at > 1 or not ladder.let_in_at)
         and (ladder.at > ladder.let_in_at or not measurement.others_wait)
         and _has_time_above(thresholds, thread, ladder, measurement.streams[key].rendering, measurement.demand)
     ]
@@ -411,7 +438,7 @@ def _slowest(
 ) -> Sequence[Key]:
     """Return which of the streams that have waited too long for IRs step down: as large a part of them as the longest
     wait is too long, those on the highest steps first. They wait in one queue, so each gains by the steps of others."""
-    since_s = measurement.now_s - thread.changed_s
+    since_s = measurement.now_s - thread.waits_since_s
     waits_s = {
         key: _new_wait_s(thresholds, measurement.streams[key].ir_wait_s or 0.0, since_s)
         for key, ladder in ladders.items()
@@ -433,14 +460,18 @@ def _best_off(
     thresholds: Thresholds, ladders: Mapping[Key, Ladder], measurement: Measurement[Key]
 ) -> tuple[Sequence[Key], bool]:
     """Return which streams step down in a thread with too much to do, and whether that is expected to be enough: those
-    on the highest steps, and as many as it takes, by what their blocks take now."""
+    on the highest steps, and as many as it takes, by what their blocks take now. If that is little, and all of them
+    would save less, only some do: most steps save no rendering."""
     ranked = sorted((key for key, ladder in ladders.items() if not ladder.is_lowest), key=lambda key: ladders[key].at)
     highest = [key for key in ranked if ladders[key].at == ladders[ranked[0]].at]
     rendering = {key: sample.rendering for key, sample in measurement.streams.items()}
     excess = measurement.demand - thresholds.relieved_busy
     saved = [*itertools.accumulate(_saving(thresholds, ladders[key]) * rendering[key] for key in highest)]
-    needed = max(1 + sum(so_far < excess for so_far in saved), math.ceil(thresholds.least_lowered * len(ladders)))
-    return highest[:needed], needed <= len(highest)
+    least = math.ceil(thresholds.least_lowered * len(ladders))
+    needed = max(1 + sum(so_far < excess for so_far in saved), least)
+    is_enough = needed <= len(highest)
+    is_little = measurement.demand <= thresholds.full_busy
+    return highest[: least if is_little and not is_enough else needed], is_enough
 
 
 def _saving(thresholds: Thresholds, ladder: Ladder) -> float:

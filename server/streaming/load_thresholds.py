@@ -103,6 +103,9 @@ class Thresholds:
     shared_core: float = 0.75
     """Share of a core that rendering and responses may take together: the event loop, plans and checks need the
     rest."""
+    used_of_spare: float = 0.8
+    """Share of the cores that all else leaves which responses below the top of the ladders take: with all of them,
+    every short load would make all of them wait."""
     least_ir_share: float = 1 / 3
     """Share of `ir_share` that responses get however busy a thread is: reverberation keeps following."""
     requests_ahead: int = 1

@@ -1,9 +1,10 @@
-"""What rendering a stream costs on this host: CPU time of a block, of each emitter in it, and of an exchange of an
-impulse response (IR). It is measured in a tenth of a second with sessions of one emitter and of several, whose listener
-moves."""
+"""What a stream costs on this host: CPU time of a block, of each emitter in it, of an exchange of an impulse response
+(IR), and of an IR in a request for those of several emitters. It is measured in some tenths of a second with sessions
+of one emitter and of several, whose listener moves."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,7 @@ from server.rendering.ingest import DryAudio
 from server.responses.ir_request import IrResponse, compute_irs
 from server.scene.manifest import QualityLevel
 from server.streaming.headroom import RenderCost, StreamKind
+from server.streaming.load_thresholds import THRESHOLDS
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 
@@ -26,6 +28,8 @@ _EMITTERS = 8
 _BLOCKS = 16
 _ROUNDS = 4
 _CLIP_SAMPLES = 8_192
+_MOST_FIRST_S = 0.05
+"""A level whose first responses take longer is not measured again."""
 
 
 def measure_rendering(
@@ -48,8 +52,43 @@ def measure_rendering(
         )
         emitter_s = max(0.0, (many[0] - few[0]) / (_EMITTERS - 1))
         cost = RenderCost(max(0.0, few[0] - emitter_s), emitter_s, max(0.0, many[1] / _EMITTERS))
+        cost = replace(cost, sharing=levels[names[0]].kind.sharing)
         costs |= dict.fromkeys(names, cost)
+    for name, cost in costs.items():
+        response_s, early_share = _time_requests(levels, filters, field_filters, name, time_s)
+        costs[name] = replace(cost, response_s=response_s, early_share=early_share)
     return costs
+
+
+def _time_requests(
+    levels: FieldsByLevel,
+    filters: HeadFilters,
+    field_filters: HeadFilters | None,
+    level: str,
+    time_s: Callable[[], float],
+) -> tuple[float, float]:
+    """Return the CPU seconds of an IR in a request for those of several emitters, of which none are kept, and the share
+    of them that one takes whose later part is kept."""
+    firsts_s = []
+    for _ in range(_ROUNDS):
+        levels.node_cache.clear()
+        began_s = time_s()
+        walk = _Walk(levels, filters, field_filters, level, _EMITTERS, time_s=time_s)
+        firsts_s.append(walk.first_s)
+        if time_s() - began_s > _MOST_FIRST_S:
+            break
+    whole_s = min(firsts_s)
+    if levels[level].kind.reuses_responses:
+        return whole_s / _EMITTERS, 1.0
+    walk.keep_late_parts()
+    early_s = []
+    for _ in range(_ROUNDS):
+        walk.play(1)
+        began_s = time_s()
+        computed = walk.compute()
+        early_s.append(time_s() - began_s)
+        walk.exchange(computed)
+    return whole_s / _EMITTERS, min(1.0, min(early_s) / whole_s)
 
 
 def kind_of(
@@ -60,7 +99,12 @@ def kind_of(
     samples = block_size / BLOCK_SIZE
     channels = 1.0 if order is None else max(1.0, harmonic_count(order) / 2)
     scaled = {
-        name: RenderCost(cost.block_s, cost.emitter_s * samples * channels, cost.exchange_s * channels)
+        name: replace(
+            cost,
+            emitter_s=cost.emitter_s * samples * channels,
+            exchange_s=cost.exchange_s * channels,
+            response_s=None if order is not None else cost.response_s,
+        )
         for name, cost in costs.items()
     }
     walk = {name: _walk_share(field.level) for name, field in levels.items()}
@@ -106,6 +150,7 @@ class _Walk:
         field_filters: HeadFilters | None,
         level: str,
         emitters: int,
+        time_s: Callable[[], float] = time.thread_time,
     ) -> None:
         field = levels[level]
         start = levels.bundle.manifest.start
@@ -126,13 +171,24 @@ class _Walk:
             window=2 * (_ROUNDS + 2) * _BLOCKS,
             field_filters=field_filters,
         )
-        for number in range(emitters):
-            self._session.receive(AddEmitter(id=str(number), clip="noise", position=start.emitter))
         self._places: tuple[Vector3, Vector3] = start.listener, start.emitter
         self._pose_id = 0
+        for number in range(emitters):
+            # On the way from the emitter's place to the listener's, so that no two share a response.
+            self._session.receive(
+                AddEmitter(id=str(number), clip="noise", position=self._at(1 - 0.3 * number / emitters))
+            )
         self._move()
-        self.exchange(self.compute())
+        began_s = time_s()
+        computed = self.compute()
+        self.first_s = time_s() - began_s
+        """CPU seconds of the request for the first IRs of all emitters."""
+        self.exchange(computed)
         self._session.render_block()
+
+    def keep_late_parts(self) -> None:
+        """Have the later parts of IRs kept from now on, as on the steps below the top."""
+        self._session.set_quality(replace(self._session.quality, late_reach_m=THRESHOLDS.late_reach_m), "chosen")
 
     def play(self, blocks: int) -> None:
         for _ in range(blocks):
@@ -150,7 +206,11 @@ class _Walk:
     def _move(self) -> None:
         """Go to and fro on the way from the listener's place to the emitter's."""
         self._pose_id += 1
-        share = 0.3 + 0.2 * np.sin(0.3 * self._pose_id)
+        position = self._at(0.3 + 0.2 * float(np.sin(0.3 * self._pose_id)))
+        self._session.receive(ListenerPose(pose_id=self._pose_id, position=position, yaw=0.05 * self._pose_id))
+
+    def _at(self, share: float) -> Vector3:
+        """So far on the way from the listener's place to the emitter's."""
         here, there = (np.asarray(place) for place in self._places)
         x, y, z = (float(part) for part in here + share * (there - here))
-        self._session.receive(ListenerPose(pose_id=self._pose_id, position=(x, y, z), yaw=0.05 * self._pose_id))
+        return x, y, z

@@ -25,7 +25,7 @@ from server.protocol.snapshot import Snapshot
 from server.rendering.output import Rendered
 from server.responses.ir_request import IrRequest, compute_irs
 from server.runtime.workers import Workers
-from server.streaming.audience import Audience, Member, NewListener
+from server.streaming.audience import COST_SMOOTHING, Audience, Member, NewListener
 from server.streaming.doors import DoorRequest, DoorsMoved
 from server.streaming.inbox import ChosenSteps, ComputedResponse, Inbox, StreamMessage, TakeSnapshot
 from server.streaming.load_policy import Ladder, LoadSample
@@ -45,7 +45,6 @@ _MAX_BEHIND_S = 0.5
 _LOAD_SMOOTHING = 0.02
 _MEASURED_AFTER_S = 2.0
 """Seconds of sound until a stream has its emitters, and the smoothed load has followed."""
-_COST_SMOOTHING = 0.2
 _logger = logging.getLogger(__name__)
 
 
@@ -89,6 +88,14 @@ class Rendering:
     """Seconds that it took to render blocks of so many seconds."""
 
     cost_s: float = 0.0
+    duration_s: float = 0.0
+
+
+@dataclass
+class Requested:
+    """CPU seconds that requests for impulse responses took, and seconds until workers were done with them."""
+
+    cpu_s: float = 0.0
     duration_s: float = 0.0
 
 
@@ -156,8 +163,8 @@ class Stream:
         self.shown = ShownCost()
         self._rendered = Rendering()
         """Blocks of this period."""
-        self._request_cpu_s = 0.0
-        """CPU time of the requests that were answered in this period."""
+        self._requested = Requested()
+        """Requests that were answered in this period."""
         self._inbox = Inbox()
         self._checking = PendingWork()
         self._pause = Pause()
@@ -357,13 +364,14 @@ class Stream:
         """The smoothed CPU time of a request for impulse responses of every listener; 0 before the first answer."""
         return sum(member.request_s for member in self.audience.members)
 
-    def note_cost(self, *, period_s: float, saving: float, memory: float) -> None:
+    def note_cost(self, *, period_s: float, saving: float, memory: float) -> Requested:
         """Note what the stream took in the last `period_s`, in which its blocks took the share `saving` of what they
-        take one at a time."""
+        take one at a time; return what its requests took."""
         self.shown.is_live = not self.audience.runs_by_itself
         rendering = self.load / (1.0 if self.shown.is_live else saving)
-        responses, self._request_cpu_s = self._request_cpu_s / period_s, 0.0
-        self.shown.note(rendering=rendering, responses=responses, memory=memory)
+        requested, self._requested = self._requested, Requested()
+        self.shown.note(rendering=rendering, responses=requested.cpu_s / period_s, memory=memory)
+        return requested
 
     def sample_load(self, now_s: float) -> LoadSample:
         """Return the load of this stream since the last call. Its wait for IRs does not count before `is_measured`: its
@@ -553,8 +561,9 @@ class Stream:
             _logger.error("no impulse response for pose %d", request.pose_id, exc_info=computed)
             return self.audience.give_up(member, request) if member in self.audience.members else []
         member.times.response.add(computed.duration_s)
-        member.request_s = _smoothed(member.request_s, computed.cpu_s)
-        self._request_cpu_s += computed.cpu_s
+        member.note_request(computed.cpu_s, is_first=request.is_first)
+        self._requested.cpu_s += computed.cpu_s
+        self._requested.duration_s += computed.duration_s
         return self.audience.accept(member, computed.response) if member in self.audience.members else []
 
     def _status(self, member: Member, now_s: float) -> Status:
@@ -581,7 +590,7 @@ class Stream:
 
 
 def _smoothed(cost_s: float, newest_s: float) -> float:
-    return cost_s + (_COST_SMOOTHING if cost_s else 1.0) * (newest_s - cost_s)
+    return cost_s + (COST_SMOOTHING if cost_s else 1.0) * (newest_s - cost_s)
 
 
 def _plan_timed(request: PlanRequest) -> tuple[Plan, float]:

@@ -93,6 +93,7 @@ NO_LIMITS = {
         server.runtime.logs:_MOST_KINDS
         server.runtime.logs:_MOST_TOGETHER server.runtime.pace:_LONGEST_NAP_S server.runtime.thread_watch:_MOST_DEATHS
         server.streaming.audio_engine:_MOST_AT_A_TICK server.streaming.calibration:_MOST_MS
+        server.streaming.render_costs:_MOST_FIRST_S
         server.streaming.session:_MOST_DOOR_INTERVAL_S server.streaming.stream:_MAX_BEHIND_S
         server.streaming.stream_times:_MOST_WAITING server.streaming.audience:_MOST_NUMBER
         server.scene.outline:_MOST_FAULTS_TOLD server.rendering.mixer_set:_MOST

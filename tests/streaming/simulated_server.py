@@ -66,6 +66,13 @@ class Costs:
     """More of a block that fades to other responses: the convolver runs twice."""
     send_s: float = 20e-6
     plan_s: float = 2e-3
+    pose_s: float = 0.0
+    """What a pose takes of the audio thread."""
+    begin_s: float = 0.0
+    begin_emitter_s: float = 0.0
+    """What a stream that begins, and each of its emitters, take of the event loop."""
+    walk_hz: float = 0.0
+    """Requests a second at which a walk costs its mean. With fewer, more of what is kept is too far away."""
     spread: float = 0.1
     """Standard deviation of the logarithm of each cost."""
 
@@ -73,11 +80,12 @@ class Costs:
 @dataclass(frozen=True)
 class SimulatedLevel:
     """A quality level: `miss_ms` is what a response takes where nothing was kept, as a server measures it when it
-    starts, and `walk_ms` the mean on a walk."""
+    starts, and `walk_ms` the mean on a walk. `alone_ms` is what one takes that is asked for alone, if that is more."""
 
     level: QualityLevel
     miss_ms: float
     walk_ms: float
+    alone_ms: float = 0.0
 
 
 LEVELS = (
@@ -101,12 +109,49 @@ LEVELS = (
 )
 """Of the apartment, cheapest first (`docs/results/quality-levels.md`), at the speed of that core, where the best takes
 0.55 ms (`docs/results/speed.md`); and one more that shares a tail."""
+APARTMENT_COSTS = Costs(
+    block_s=0.29e-3,
+    early=0.7,
+    saved_by_doubling=1 / 7,
+    exchange_s=0.4e-3,
+    send_s=72e-6,
+    pose_s=80e-6,
+    begin_s=4e-3,
+    begin_emitter_s=0.3e-3,
+    walk_hz=30.0,
+)
+APARTMENT = (
+    SimulatedLevel(
+        QualityLevel(name="turned", field="any", reuse=Reuse(spacing_m=5.0, turn_deg=360, first_reflections="node")),
+        0.20,
+        0.0025,
+        0.48,
+    ),
+    SimulatedLevel(
+        QualityLevel(name="5m", field="any", reuse=Reuse(spacing_m=5.0, turn_deg=120, first_reflections="node")),
+        0.20,
+        0.0036,
+        0.51,
+    ),
+    SimulatedLevel(
+        QualityLevel(name="2m", field="any", reuse=Reuse(spacing_m=2.0, turn_deg=120, first_reflections="node")),
+        0.26,
+        0.016,
+        0.55,
+    ),
+    SimulatedLevel(QualityLevel(name="1m", field="any", reuse=Reuse(spacing_m=1.0, turn_deg=120)), 0.34, 0.086, 0.56),
+    SimulatedLevel(QualityLevel(name="best", field="any"), 0.20, 0.20, 0.43),
+)
+"""What streams of the apartment cost as `nafir bench overload` found it on one core of an EPYC with AVX-512: a response
+alone costs twice as much as one of sixteen, an early part hardly less than a whole response, and blocks little."""
 
 
 @dataclass
 class _Job:
     left_s: float
     finish: Callable[[], None]
+    began_s: float = 0.0
+    """When a worker began with it."""
 
 
 class Machine:
@@ -158,10 +203,12 @@ class Machine:
         """On the event loop, one after the other."""
         self._loop.append(_Job(cost_s, finish))
 
-    def compute(self, cost_s: float, finish: Callable[[], None], *, is_urgent: bool = False) -> None:
+    def compute(self, cost_s: float, finish: Callable[[], None], *, is_urgent: bool = False) -> _Job:
         """On a worker, as soon as one is free."""
-        (self._urgent if is_urgent else self._waiting).append(_Job(cost_s, finish))
+        job = _Job(cost_s, finish)
+        (self._urgent if is_urgent else self._waiting).append(job)
         self._employ()
+        return job
 
     def work(self, cost_s: float) -> None:
         """Have the audio thread work."""
@@ -174,6 +221,7 @@ class Machine:
     def _employ(self) -> None:
         while len(self._running) < self.workers and (self._urgent or self._waiting):
             self._running.append((self._urgent or self._waiting).popleft())
+            self._running[-1].began_s = self.now_s
 
     def _pass(self, until_s: float, *, work_s: float = _NEVER, is_over: Callable[[], bool] = lambda: False) -> None:
         is_working = work_s < _NEVER
@@ -366,6 +414,8 @@ class Client:
     """When its stream moved to which step; 0 is the best."""
     answers_s: list[float] = field(default_factory=list)
     """When responses came."""
+    asked_s: float = -_NEVER
+    """When responses were last asked for."""
     began_at: int = 0
     """The step on which the server let it in."""
     refused: Refusal | None = None
@@ -411,11 +461,11 @@ class SimulatedServer:
         self._thresholds = thresholds
         self._rng = np.random.default_rng(seed)
         self._luck: Iterator[float] = iter(())
-        self._rendered = 0
+        self._rendered = self._poses = 0
         self._busy_s = 0.0
         self._worst = 0.0
         self._by_session: dict[SimulatedSession, Client] = {}
-        here_ms = {each.level.name: each.miss_ms / speeds[-1] for each in levels}
+        here_ms = {each.level.name: max(each.alone_ms, each.miss_ms) / speeds[-1] for each in levels}
         self._offer = Offer(tuple(each.level for each in levels), here_ms)
         self.engine = AudioEngine(self._post, self, thresholds=thresholds, time_s=self.machine)
         (self.thread,) = self.engine.threads
@@ -517,8 +567,15 @@ class SimulatedServer:
         each_s, exchange_s = self._costs.block_s / 16 / speed, self._costs.exchange_s / 16 / speed
         render = {}
         for name, level in self._levels.items():
-            share = self._costs.shared[kind_of(level.level).sharing]
-            render[name] = RenderCost(self._costs.tick_s / speed, share * each_s, exchange_s)
+            sharing = kind_of(level.level).sharing
+            render[name] = RenderCost(
+                self._costs.tick_s / speed,
+                self._costs.shared[sharing] * each_s,
+                exchange_s,
+                response_s=level.miss_ms / 1000 / self.machine.speeds[-1],
+                early_share=1.0 if level.level.reuse else self._costs.early,
+                sharing=sharing,
+            )
         walk = {name: level.walk_ms / level.miss_ms for name, level in self._levels.items()}
         return StreamKind(("simulated", 24_000, 1_024, None), BLOCK_S, render, walk)
 
@@ -567,6 +624,7 @@ class SimulatedServer:
         )
         if client.place is not None:
             self.admission.open(client.place, client.stream)
+            self._take_loop(self._costs.begin_s + client.emitters * self._costs.begin_emitter_s)
             for _ in range(client.emitters):
                 assert self.admission.add_emitter(client.place, is_live=False) is None
         self.engine.open(client.stream)
@@ -575,6 +633,7 @@ class SimulatedServer:
     def _move(self, client: Client, first_s: float, pose_id: int) -> None:
         if self.now_s >= client.closed_s:
             return
+        self._poses += 1
         client.stream.offer(ListenerPose.model_construct(pose_id=pose_id))
         self.machine.at(first_s + pose_id / self._poses_hz, lambda: self._move(client, first_s, pose_id + 1))
 
@@ -583,12 +642,16 @@ class SimulatedServer:
         future: Future = Future()
         if kind == "plan":
             cost_s = self._costs.plan_s * self._chance()
-            self._compute(future, cost_s, (SimpleNamespace(), cost_s), is_urgent=False)
+            self._compute(future, cost_s, lambda _: (SimpleNamespace(), cost_s), is_urgent=False)
             return future
         _, request, session = arguments
         client, level = self._by_session[session], self._levels[request.level]
         # The first response of each emitter finds nothing kept.
-        each_ms = level.miss_ms if request.is_first else level.walk_ms
+        each_ms = level.miss_ms
+        if not request.is_first:
+            since_s = self.now_s - client.asked_s
+            each_ms = min(each_ms, level.walk_ms * max(1.0, since_s * self._costs.walk_hz))
+        client.asked_s = self.now_s
         whole = client.emitters
         if session.quality.late_reach_m and not (request.is_first or kind_of(level.level).reuses_responses):
             whole = min(whole, THRESHOLDS.whole_at_once)
@@ -597,21 +660,29 @@ class SimulatedServer:
         self._compute(
             future,
             cost_s,
-            ComputedResponse(request, cost_s, cost_s / self.machine.speeds[-1]),
+            lambda duration_s: ComputedResponse(request, duration_s, cost_s / self.machine.speeds[-1]),
             is_urgent=is_urgent,
             note=lambda: self._note_answer(client),
         )
         return future
 
     def _compute(
-        self, future: Future, cost_s: float, result: object, *, is_urgent: bool, note: Callable[[], None] = lambda: None
+        self,
+        future: Future,
+        cost_s: float,
+        result: Callable[[float], object],
+        *,
+        is_urgent: bool,
+        note: Callable[[], None] = lambda: None,
     ) -> None:
+        """Have a worker come to a result, which may depend on how long that took."""
+
         def finish() -> None:
             if future.set_running_or_notify_cancel():
-                future.set_result(result)
+                future.set_result(result(self.machine.now_s - job.began_s))
                 note()
 
-        self.machine.compute(cost_s, finish, is_urgent=is_urgent)
+        job = self.machine.compute(cost_s, finish, is_urgent=is_urgent)
 
     def _note_answer(self, client: Client) -> None:
         client.answers_s.append(self.now_s)
@@ -627,7 +698,7 @@ class SimulatedServer:
     def _render(self, sessions: list[SimulatedSession]) -> list[Rendered]:
         """As `render_all`: the blocks of one session come one after the other."""
         costs, blocks = self._costs, []
-        cost_s = costs.tick_s
+        cost_s, self._poses = costs.tick_s + self._poses * costs.pose_s, 0
         for session, count in Counter(sessions).items():
             emitters = self._by_session[session].emitters
             share = costs.shared[session.sharing] * emitters / 16
@@ -646,6 +717,9 @@ class SimulatedServer:
     def _post(self, call: Callable[[], None]) -> None:
         """As the event loop, for which each block is work."""
         cost_s, self._rendered = self._costs.send_s * max(1, self._rendered) * self._chance(), 0
+        self._take_loop(cost_s, call)
+
+    def _take_loop(self, cost_s: float, call: Callable[[], None] = lambda: None) -> None:
         self._loop_s += cost_s / max(self.machine.speeds)
         self.machine.send(cost_s, call)
 

@@ -27,7 +27,7 @@ from server.protocol.snapshot import Snapshot
 from server.rendering.convolver import Sharing
 from server.rendering.renderer import render_all
 from server.responses.ir_request import compute_irs
-from server.streaming.audience import Audience, NewListener, Roster
+from server.streaming.audience import Audience, Member, NewListener, Roster
 from server.streaming.quality_steps import QualityStep
 from server.streaming.session import Session
 from server.streaming.stream_times import StreamTimes
@@ -433,3 +433,14 @@ def test_a_roster_gives_a_number_again_only_after_all_others():
         numbers.append(roster.enter("a"))
     assert len(set(numbers[:253])) == 253
     assert set(numbers) == set(range(1, 256)) - {2}
+
+
+def test_first_responses_of_emitters_say_nothing_of_what_later_requests_cost(field, filters):
+    member = Member(Room(field, filters).session())
+    for cost_s in (0.008, 0.006):
+        member.note_request(cost_s, is_first=True)
+        assert member.request_s == pytest.approx(cost_s)
+    member.note_request(0.002, is_first=False)
+    assert member.request_s == pytest.approx(0.002)
+    member.note_request(0.007, is_first=True)  # of another emitter, beside those that are there
+    assert 0.002 < member.request_s < 0.007

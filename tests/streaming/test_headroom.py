@@ -9,6 +9,7 @@ from server.streaming.headroom import (
     ServerLoad,
     StreamCost,
     ThreadLoad,
+    blocks_for_waits,
     blocks_needed,
     busy,
     fits_on_top,
@@ -17,6 +18,8 @@ from server.streaming.headroom import (
     obstacle_to_change,
     retry_after_s,
     seconds_to_next_ending,
+    spare_for_irs,
+    taken_elsewhere,
 )
 from server.streaming.load_thresholds import THRESHOLDS
 
@@ -38,13 +41,75 @@ def rises(load, request_s, eased):
     return fits_on_top(LIMITS, THRESHOLDS, load, request_s, eased=eased)
 
 
+def test_those_who_are_there_may_ask_for_more_where_newcomers_are_refused():
+    """The reserve is theirs: of rendering, of the event loop, of cores and of responses."""
+    kinds = {
+        "rendering": StreamCost(0.05),
+        "event_loop": StreamCost(0.0, loop=0.02),
+        "cores": StreamCost(0.02, loop=0.02, request_s=0.001, rate_hz=5.0),
+        "responses": StreamCost(0.004, request_s=0.004, rate_hz=12.0),
+    }
+    one_core = replace(EMPTY, threads=(ThreadLoad(),), cores=1, most_streams=1_000)
+    for scarce, cost in kinds.items():
+        full = next(load for number in range(1, 1_000) if found(load := crowd(number, cost, one_core), cost))
+        assert found(full, cost) == scarce
+        more = replace(
+            cost, rendering=1.1 * cost.rendering + 0.001, loop=1.1 * cost.loop, request_s=1.05 * cost.request_s
+        )
+        assert obstacle_to_change(LIMITS, THRESHOLDS, full, 0, cost, more) is None
+        much = replace(cost, rendering=1.0, loop=1.0, request_s=1.0)
+        assert obstacle_to_change(LIMITS, THRESHOLDS, full, 0, cost, much) is not None
+
+
+def test_newcomers_are_refused_while_somebody_waits_too_long_for_responses():
+    cost = StreamCost(0.01, request_s=0.001, rate_hz=5.0)
+    waiting = replace(crowd(2), longest_wait=1.1 * LIMITS.full_waits)
+    assert found(crowd(2), cost) is None
+    assert found(waiting, cost) == "responses"
+    assert obstacle_to_change(LIMITS, THRESHOLDS, waiting, 0, cost, replace(cost, request_s=0.002)) is None
+
+
+def test_a_newcomer_fits_only_if_all_keep_the_responses_of_the_lowest_step():
+    cost = StreamCost(0.004, request_s=0.003, rate_hz=12.0)
+    load = replace(EMPTY, threads=(ThreadLoad(),), cores=1, most_streams=1_000)
+    while found(load, cost) is None:
+        load = load.plus(0, cost)
+    least_hz = THRESHOLDS.least_ir_rate_hz
+    assert (
+        THRESHOLDS.ir_share / load.eased_round_s
+        >= least_hz
+        > LIMITS.for_newcomers**2 * THRESHOLDS.ir_share / (load.eased_round_s + cost.request_s)
+    )
+    # What others take of a core is missing, and so is what the interpreter's lock costs.
+    slowed = replace(load, elsewhere=0.9)
+    assert spare_for_irs(LIMITS, THRESHOLDS, slowed) < spare_for_irs(LIMITS, THRESHOLDS, load)
+    some = crowd(20, cost, replace(EMPTY, threads=(ThreadLoad(),), cores=1))
+    assert [found(replace(some, elsewhere=cores), cost) for cores in (0.0, 0.9)] == [None, "responses"]
+
+
+def test_what_workers_do_not_get_is_taken_elsewhere():
+    load = crowd(2, StreamCost(0.1, loop=0.05), replace(EMPTY, cores=1))
+    spare = spare_for_irs(LIMITS, THRESHOLDS, load) * 2
+    assert taken_elsewhere(LIMITS, THRESHOLDS, load, spare) == pytest.approx(0.0)
+    assert taken_elsewhere(LIMITS, THRESHOLDS, load, spare - 0.3) == pytest.approx(0.3)
+    assert taken_elsewhere(LIMITS, THRESHOLDS, load, 1.0) == 0.0
+
+
+def test_poses_are_heard_later_before_reverberation_lags():
+    cost = StreamCost(0.024, loop=0.0035, request_s=0.0024, rate_hz=12.0)
+    load = replace(EMPTY, threads=(ThreadLoad(),), cores=1, most_streams=1_000)
+    blocks = [blocks_for_waits(LIMITS, THRESHOLDS, crowd(number, cost, load)) for number in range(41)]
+    assert blocks == sorted(blocks)
+    assert (blocks[5], blocks[40]) == (1, 8)
+
+
 def test_a_stream_that_has_the_server_to_itself_always_fits():
     assert found(EMPTY, StreamCost(50.0, loop=3.0, request_s=9.0)) is None
 
 
 def test_streams_are_let_in_until_a_thread_is_full_and_no_further():
     most = next(number for number in range(100) if found(crowd(number)) is not None)
-    assert busy(LIMITS, crowd(most).threads[0], 8) > LIMITS.full_rendering - QUIET.rendering
+    assert busy(LIMITS, crowd(most).threads[0], 8) > LIMITS.for_newcomers * LIMITS.full_rendering - QUIET.rendering
     assert all(found(crowd(number)) is None for number in range(most))
 
 
@@ -152,7 +217,7 @@ def test_a_stream_that_steps_up_no_longer_counts_among_those_below():
     """It fits where it would fit as a newcomer beside the others."""
     eased, none = StreamCost(0.0, request_s=0.003, rate_hz=12.0, patience_s=0.15), StreamCost(0.0)
     one_core = replace(EMPTY, threads=(ThreadLoad(),), cores=1)
-    loads = [crowd(number, eased, one_core) for number in range(1, 20)]
+    loads = [crowd(number, eased, one_core) for number in range(1, 40)]
     as_newcomer = [rises(others, 0.006, none) for others in loads[:-1]]
     assert [rises(all_of_them, 0.006, eased) for all_of_them in loads[1:]] == as_newcomer
     border = as_newcomer.index(False)

@@ -22,6 +22,7 @@ from server.streaming.load_policy import (
     decide,
     ir_interval_s,
     ir_share,
+    longest_wait,
     patience_s,
     render_ahead,
     requests_at_once,
@@ -48,7 +49,7 @@ class Host:
 
     def __init__(self, ladders, sample=lambda _: LoadSample(), busy=lambda _: 0.0, ahead=FULL_AHEAD):
         self.state, self.now_s, self.steps = LoadState(ThreadState(ahead), dict(enumerate(ladders))), 100.0, []
-        self.sample, self.busy, self.others_wait = sample, busy, False
+        self.sample, self.busy, self.others_wait, self.others_begin = sample, busy, False, False
 
     @property
     def ladders(self):
@@ -57,7 +58,13 @@ class Host:
     def measure(self):
         self.now_s += PERIOD_S
         samples = {number: self.sample(number) for number in self.state.ladders}
-        measurement = Measurement(self.now_s, self.busy(self.ladders), samples, others_wait=self.others_wait)
+        measurement = Measurement(
+            self.now_s,
+            self.busy(self.ladders),
+            samples,
+            others_wait=self.others_wait,
+            others_begin=self.others_begin,
+        )
         self.state, decision = decide(THRESHOLDS, self.state, measurement)
         self.steps += [(self.now_s, number, reason) for number, reason in decision.moved.items()]
         return decision
@@ -124,6 +131,37 @@ def test_while_others_wait_to_be_let_in_nobody_rises_above_where_it_was_let_in()
     assert [each.at for each in host.run(120).ladders] == [2, 2]
     host.others_wait = False
     assert [each.at for each in host.run(120).ladders] == [0, 0]
+
+
+def test_waits_while_others_begin_lower_nobody_unless_they_go_on():
+    def host(wait_s):
+        waiting = Host([ladder(1, 2)], lambda _: LoadSample(ir_wait_s=wait_s))
+        waiting.others_begin = True
+        return waiting.run(10)
+
+    begun = host(1.0)
+    assert begun.steps == []
+    assert host(math.inf).steps == []  # none of them began after the newcomers
+    begun.others_begin = False
+    begun.run(0.75)
+    assert begun.steps == []
+    assert begun.run(2.0).steps[0][2] == "load"
+
+
+def test_a_full_thread_lowers_streams_while_others_begin():
+    host = Host([ladder(1, 2)], busy=lambda _: 1.0)
+    host.others_begin = True
+    assert host.run(2).steps
+
+
+def test_the_longest_wait_is_that_of_the_least_patient_whose_step_is_in_effect():
+    ladders = [ladder(1, 2), ladder(1, 2, at=2), ladder(1, 2)]
+    samples = LoadSample(ir_wait_s=0.1), LoadSample(ir_wait_s=0.45), LoadSample(ir_wait_s=9.0, is_in_effect=False)
+    waits = [wait / patience_s(THRESHOLDS, each.step) for wait, each in zip((0.1, 0.45), ladders, strict=False)]
+    state = LoadState(ThreadState(), dict(enumerate(ladders)))
+    measurement = Measurement(0.0, 0.5, dict(enumerate(samples)))
+    assert longest_wait(THRESHOLDS, state, measurement) == pytest.approx(max(waits))
+    assert longest_wait(THRESHOLDS, LoadState(ThreadState(), {}), Measurement(0.0, 0.5, {})) == 0
 
 
 def test_between_overloaded_and_well_nothing_moves():
@@ -299,6 +337,8 @@ def test_responses_leave_to_rendering_and_the_event_loop_what_these_need():
     shares = [ir_share(THRESHOLDS, busy=busy) for busy in np.linspace(0.4, 1.0, 13)]
     assert shares == sorted(shares, reverse=True)
     assert ir_share(THRESHOLDS, busy=0.6) == pytest.approx(0.15)
+    assert ir_share(THRESHOLDS, busy=0.3, spare_cores=0.25) == pytest.approx(0.2)  # other programs have the rest
+    assert ir_share(THRESHOLDS, busy=0.3, spare_cores=0.0) == shares[-1]
     assert shares[-1] == pytest.approx(0.25 / 3)  # where nothing is left, reverberation still follows
     # A host that allows more than a core gets a third of it at least.
     assert ir_share(dataclasses.replace(THRESHOLDS, ir_share=2.0), busy=0.2) == pytest.approx(2.0 / 3)

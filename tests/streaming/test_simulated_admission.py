@@ -1,11 +1,16 @@
 """Laws of admission on simulated cores: three times as many ask at once as a server can bear."""
 
 from functools import cache
+from itertools import pairwise
 
+import numpy as np
 import pytest
 
+from server.streaming import headroom
+from server.streaming.admission import Admission
 from server.streaming.headroom import LIMITS
-from tests.streaming.simulated_server import BLOCK_S, SimulatedServer
+from server.streaming.load_thresholds import THRESHOLDS
+from tests.streaming.simulated_server import APARTMENT, APARTMENT_COSTS, BLOCK_S, SimulatedServer
 
 END_S = 30.0
 CORES = {
@@ -94,6 +99,87 @@ def test_those_who_come_back_when_they_were_told_to_fill_what_is_left_and_cost_n
     assert most_steps_down(admitted(server)) <= 0
     # Room that was left was for them, and for nobody there to rise.
     assert all(at >= client.began_at for client in admitted(server) for at_s, at in client.moves if at_s < 8.0)
+
+
+RUSH = {
+    "one core": {"speeds": (1.0,)},
+    "one core that others use too": {"speeds": (1.0,), "is_shared": True},
+    "two cores": {"speeds": (1.0, 1.0)},
+    "four emitters": {"speeds": (1.0,), "emitters": 4},
+}
+"""Of a real server, a hundred and fifty ask at once, and those refused come back for half a minute."""
+rush_each = pytest.mark.parametrize(
+    "name", [name if name.startswith("one core") else pytest.param(name, marks=pytest.mark.long) for name in RUSH]
+)
+
+
+def rush(*, speeds=(1.0,), emitters=16, is_shared=False, until_s=36.0):
+    server = SimulatedServer(speeds=speeds, costs=APARTMENT_COSTS, levels=APARTMENT, admits=True)
+    server.arrive(150, at_s=1.0, emitters=emitters, come_back_until_s=31.0)
+    if is_shared:
+        rng = np.random.default_rng(0)
+        for half_s in range(1, round(2 * until_s)):
+            server.occupy(half_s / 2, 0.5, share=float(rng.uniform(0.02, 0.15)))
+            if half_s % 3 == 0:
+                server.pause(half_s / 2, float(rng.uniform(0.005, 0.04)))
+    return server.run(until_s)
+
+
+@cache
+def rushed(name):
+    return rush(**RUSH[name])
+
+
+def steps_down(clients):
+    """How many steps all streams went down."""
+    stood = [[client.began_at, *(at for _, at in client.moves)] for client in clients]
+    return sum(max(0, after - before) for steps in stood for before, after in pairwise(steps))
+
+
+@rush_each
+def test_three_times_the_capacity_asks_and_comes_back_and_nobody_who_was_let_in_loses_quality(name):
+    there = admitted(rushed(name))
+    assert steps_down(there) == 0
+    assert late_share(there) < 0.001
+    assert any(client.refused is not None for client in there), "some came back"
+
+
+@rush_each
+def test_in_a_rush_all_are_answered_within_a_second(name):
+    assert all(client.answered_s - client.opened_s < 1.0 for client in rushed(name).clients)
+
+
+def most_on_a_core(server):
+    """Of streams at the best level, whose responses come as seldom as on the lowest step: if a core had no reserve."""
+    costs, few_hz, whole = APARTMENT_COSTS, THRESHOLDS.least_ir_rate_hz, THRESHOLDS.whole_at_once
+    none, one = (server.utilisation(streams, emitters=16, step=1, blocks_at_once=8) for streams in (0, 1))
+    # Exchanges are as few as responses.
+    blocks = one - none - costs.exchange_s * (THRESHOLDS.ir_rates_hz[0] - few_hz)
+    responses_s = APARTMENT[-1].miss_ms / 1000 * (whole + (16 - whole) * costs.early)
+    return int((1 - none - THRESHOLDS.plan_share) / (blocks + 30 * costs.pose_s + few_hz * responses_s))
+
+
+def test_a_rush_fills_what_a_core_has_room_for():
+    server = rushed("one core")
+    there, steps = admitted(server), server._offer.steps("auto", block_s=BLOCK_S)
+    at_best = [client for client in there if steps[client.began_at].level == "best"]
+    most = most_on_a_core(server)
+    assert 0.8 * most <= len(there)
+    assert 0.65 * most <= len(at_best) <= most
+
+
+@rush_each
+def test_in_a_rush_reverberation_follows_those_who_are_there(name):
+    server = rushed(name)
+    for client in admitted(server):
+        lately = sum(at_s > server.now_s - 4.0 for at_s in client.answers_s) / 4.0
+        assert lately > THRESHOLDS.least_ir_rate_hz / 2
+
+
+def test_a_server_that_keeps_no_time_for_responses_takes_the_quality_of_those_who_are_there(monkeypatch):
+    monkeypatch.setattr(headroom, "_turns_are_soon", lambda *_, **__: True)
+    monkeypatch.setattr(Admission, "_note_waits", lambda *_: None)
+    assert steps_down(admitted(rush(emitters=4, until_s=12.0))) > 20
 
 
 def test_without_admission_the_same_clients_break_the_sound():
