@@ -61,15 +61,10 @@ _PROBLEM: Final[Object] = {
 }
 _OF_A_BODY: Final = {"415": "The body is of another type than the route reads."}
 _COMPUTED: Final = ("/impulse-response", "/impulse-responses", "/loudness", "/plan", "/ambisonic-noises")
-_TAGGED: Final = (
-    "/impulse-response",
-    "/loudness",
-    "/plan",
-    "/decoder",
-    "/bundle/{file}",
-    "/ambisonic-noises",
-    "/audio",
-)
+_ENTITY_TAG: Final[Object] = {
+    "description": "For `If-None-Match`. Weak if the answer is compressed.",
+    "schema": {"type": "string"},
+}
 _RANGED: Final = ("/bundle/{file}", "/audio")
 _OF_A_RANGE: Final = {"416": "The file ends before the range that is asked for."}
 _PART: Final = {"206": {"description": "The part that `Range` asks for."}}
@@ -137,8 +132,9 @@ def describe(app: FastAPI, *, max_poses: int, is_protected: bool = False) -> Obj
                     content["example"] = answer_examples()[route]
             if path.endswith(_RANGED):
                 operation["responses"] |= _PART
-            if path.endswith(_TAGGED):
+            if method == "get" and path not in HEALTH_PATHS:
                 operation["responses"]["304"] = {"description": "The client has it already, by its `If-None-Match`."}
+                operation["responses"]["200"].setdefault("headers", {})["ETag"] = _ENTITY_TAG
     return document
 
 

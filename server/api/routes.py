@@ -27,6 +27,7 @@ from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, AskedSt
 from server.api.ranged_files import RangedBytes, RangedFile
 from server.api.response_cache import Compute, Kind
 from server.api.section import Section
+from server.api.tagged_route import TaggedRoute, has_tag
 from server.api.telemetry import ServerCollector, exposition
 from server.api.web_socket import fast_path
 from server.assets.clip_store import is_upload
@@ -73,9 +74,9 @@ CLIENT_CLOSED_REQUEST = 499
 CACHE_CONTROL = "public, max-age=3600"
 """After the hour an unchanged answer costs only a 304, by its entity tag."""
 
-api = APIRouter(prefix="/v1")
+api = APIRouter(prefix="/v1", route_class=TaggedRoute)
 health = APIRouter()
-documents = APIRouter(include_in_schema=False)
+documents = APIRouter(include_in_schema=False, route_class=TaggedRoute)
 
 _PLACE: dict[str, Any] = {"pattern": POSITION_PATTERN}
 
@@ -429,7 +430,7 @@ async def plan(
         return Response(status_code=CLIENT_CLOSED_REQUEST)
     # Costs depend on this host and this run of the server, so the tag is that of the content.
     headers = {"ETag": content_tag(body), "Cache-Control": "no-cache"}
-    if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
+    if has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return Response(body, media_type="application/json", headers=headers)
 
@@ -450,7 +451,7 @@ async def bundle_file(
         problem = f"the bundle has no file {file[:80]!r}; GET /v1/scenes/{scene}/bundle lists them"
         raise RequestError("unknown_file", problem, field="file", status=404)
     headers = {"ETag": f'"{digest[:32]}"', "Cache-Control": CACHE_CONTROL}
-    if _has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
+    if has_tag(request.headers.get("if-none-match", ""), headers["ETag"]):
         return Response(status_code=304, headers=headers)
     media_type = "application/json" if file.endswith(".json") else "application/octet-stream"
     return RangedBytes(offered.contents[file], headers=headers, media_type=media_type)
@@ -566,7 +567,7 @@ async def clip_audio(request: Request, clip: str) -> Response:
         raise UnknownClipError(clip) from exc  # it is gone meanwhile
     tag = computed_tag("clip", clip, stat_result.st_size, stat_result.st_mtime_ns)
     headers = {"ETag": tag, "Cache-Control": CACHE_CONTROL, "X-Content-Type-Options": "nosniff"}
-    if _has_tag(request.headers.get("if-none-match", ""), tag):
+    if has_tag(request.headers.get("if-none-match", ""), tag):
         return Response(status_code=304, headers=headers)
     return RangedFile(file, headers=headers, media_type=_BYTES, stat_result=stat_result)
 
@@ -696,7 +697,7 @@ def _in_state(levels: FieldsByLevel, door: list[str] | None) -> FieldsByLevel:
 async def _cached(request: Request, etag: str, media_type: str, compute: Compute, *, kind: Kind = "single") -> Response:
     """The response: 304 if the client has the body already, or else the body, computed as long as the client waits."""
     headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL}
-    if _has_tag(request.headers.get("if-none-match", ""), etag):
+    if has_tag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
     body = await _computed(request, etag, compute, kind=kind)
     if body is None:
@@ -719,9 +720,3 @@ async def _disconnected(request: Request) -> None:
     """Return once the client has gone."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
-
-
-def _has_tag(if_none_match: str, etag: str) -> bool:
-    """Whether If-None-Match names the tag, by the weak comparison of RFC 9110."""
-    tags = {tag.strip().removeprefix("W/") for tag in if_none_match.split(",")}
-    return etag in tags or "*" in tags

@@ -760,3 +760,55 @@ def test_answers_are_timed_by_route_and_lookups_of_the_cache_are_counted(shared_
         assert shared_client.get("/v1/scenes/flat/impulse-response", params=query | {"yaw_deg": "7.25"}).is_success
     after = [metric(shared_client, name) for name in (timed, looked_up % "miss", looked_up % "hit")]
     assert [now - then for now, then in zip(after, before, strict=True)] == [2, 1, 1]
+
+
+LISTS = (
+    "/v1/scenes",
+    "/v1/scenes/flat",
+    "/v1/scenes/flat/frontier",
+    "/v1/scenes/flat/section",
+    "/v1/scenes/flat/bundle",
+    "/v1/clips",
+    "/v1/clips/woman-reading",
+    "/v1/hrtfs",
+    "/v1/encodings",
+    "/v1/schemas/bundle",
+    "/asyncapi.json",
+)
+
+
+@pytest.mark.parametrize("path", LISTS)
+def test_a_list_that_a_client_has_is_not_sent_again(shared_client, path):
+    first = shared_client.get(path)
+    tag, cache = first.headers["etag"], first.headers["cache-control"]
+    assert first.status_code == 200
+    assert shared_client.head(path).headers["etag"] == tag
+    for known in (tag, f"W/{tag.removeprefix('W/')}", f'"other", {tag}', "*"):
+        again = shared_client.get(path, headers={"If-None-Match": known})
+        assert (again.status_code, again.content) == (304, b"")
+        assert again.headers["etag"].removeprefix("W/") == tag.removeprefix("W/")
+        assert again.headers["cache-control"] == cache
+    other = shared_client.get(path, headers={"If-None-Match": '"other"'})
+    assert (other.status_code, other.content) == (200, first.content)
+
+
+def test_tags_of_lists_are_those_of_their_content(shared_client):
+    plain = {"Accept-Encoding": "identity"}
+    answers = [shared_client.get(path, headers=plain) for path in LISTS]
+    assert len({answer.headers["etag"] for answer in answers}) == len(LISTS)
+    low, high = (
+        shared_client.get("/v1/scenes/flat/section", params={"height_m": height_m}, headers=plain)
+        for height_m in (0.5, 90.0)
+    )
+    assert (low.headers["etag"] == high.headers["etag"]) == (low.content == high.content)
+    assert low.content != high.content
+    assert "etag" not in shared_client.get("/v1/scenes/moon", headers=plain).headers
+    assert "etag" not in shared_client.get("/livez").headers
+
+
+def test_every_answer_to_get_may_be_told_by_its_tag(shared_client):
+    for path, operations in shared_client.get("/openapi.json").json()["paths"].items():
+        for method, operation in operations.items():
+            is_tagged = method == "get" and path not in {"/livez", "/readyz"}
+            assert ("304" in operation["responses"]) == is_tagged, path
+            assert ("ETag" in operation["responses"].get("200", {}).get("headers", {})) == is_tagged, path

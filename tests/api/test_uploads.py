@@ -85,6 +85,17 @@ def test_the_same_file_is_the_same_clip(client):
     assert again.json() == {**first.json(), "expires_at": again.json()["expires_at"]}
 
 
+def test_whoever_polls_the_list_learns_of_a_new_clip_and_of_nothing_else(client):
+    before = {"If-None-Match": client.get("/v1/clips").headers["etag"]}
+    assert client.get("/v1/clips", headers=before).status_code == 304
+    name = upload(client).json()["name"]
+    found = client.get("/v1/clips", headers=before)
+    assert found.status_code == 200
+    assert name in {clip["name"] for clip in found.json()["clips"]}
+    client.delete(f"/v1/clips/{name}")
+    assert client.get("/v1/clips", headers=before).status_code == 304
+
+
 def test_a_stream_plays_it_at_once_and_goes_on_when_it_is_deleted(client):
     name = upload(client).json()["name"]
     with client.websocket_connect("/v1/stream") as socket:
