@@ -37,6 +37,7 @@ const SLOW_MS = 1000; // after which the page says that a level is being prepare
 const GOES_ON = "What you hear goes on until it is there.";
 const REST_MS = 1000; // the turn of a head at rest is measured this often
 const RETRY_MS = 2000;
+const SHUTTING_DOWN = 1012; // a close code
 const AWAY = ["unreachable", "server_draining", "not_ready"]; // codes of a server that will be there again
 const LONGEST_RETRY_MS = 30_000;
 const CUT_M = 1.3; // above a floor: doors and windows show, and most furniture does not
@@ -717,7 +718,7 @@ class Page {
 
   #streamState(detail) {
     if (!this.playing) return;
-    const { state, attempt, retryMs, reason, isBusy, needsKey } = detail;
+    const { state, attempt, retryMs, code, reason, isBusy, needsKey } = detail;
     if (state === "connecting" && attempt === 0) {
       this.#setConnection("connecting", "Connecting");
       this.#blank();
@@ -739,7 +740,8 @@ class Page {
       if (isBusy) {
         const seconds = Math.round(retryMs / 1000);
         this.notices.show("connection", `The server has no room for another listener. Trying again in ${seconds} s.`, { lasting: true });
-      } else if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
+      } else if (code === SHUTTING_DOWN) this.notices.show("connection", "The server is shutting down. The sound goes on at the next one.");
+      else if (retryMs >= 1000) this.notices.show("connection", `The connection was lost. ${reason ?? ""} Trying again.`.replace("  ", " "));
     } else if (state === "refused") {
       if (!needsKey) this.notices.show("connection", reason, { lasting: true });
       this.#setPlaying(false);

@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from server.protocol.blocks import AudioBlock
+from server.protocol.blocks import AudioBlock, DryBlock
 from server.protocol.client_messages import (
     Acknowledge,
     AddEmitter,
@@ -220,7 +220,7 @@ def test_of_gains_in_an_outage_the_newest_is_said_and_counted(tmp_path):
 
 
 def test_a_stream_of_which_too_much_is_unsaid_begins_anew(tmp_path):
-    comings = [each for _ in range(150) for each in (["add", {"id": "p2", **at(2)}], ["remove", "p2"])]
+    comings = [each for _ in range(600) for each in (["add", {"id": "p2", **at(2)}], ["remove", "p2"])]
     _, _, resumption, anew = run(
         tmp_path,
         OPENED,
@@ -232,6 +232,67 @@ def test_a_stream_of_which_too_much_is_unsaid_begins_anew(tmp_path):
     assert len(of(Hello, anew)) == 1
     assert [each.id for each in of(AddEmitter, anew)] == ["e1"]
     assert of(AddListener, anew) == []
+
+
+def snapshot(text, handled):
+    return {"type": "snapshot", "snapshot": text, "pose_id": 0, "handled": handled, "expires_s": 120.0}
+
+
+def test_the_newest_snapshot_goes_with_the_resume_and_what_it_lacks_is_said_again(tmp_path):
+    """A live emitter and a listener are not spoken of before they are there again."""
+    live = {"id": "live", "live": True, "at": 0, **at(3)}
+    added = {"type": "emitter_added", "id": "live", "sample_clock": 0}
+    opened, _, resuming, gone_on, there = run(
+        tmp_path,
+        OPENED,
+        [
+            ["emitter", {"id": "old", "clip": "a", "at": 0, **at(2)}],
+            ["receive", snapshot("older", 0)],
+            ["receive", snapshot("newer", 1)],
+            ["emitter", live],
+            ["receive", added],
+            *JOINED,
+        ],
+        LOST,
+        [
+            ["receive", resumed(handled=1, listeners=[])],
+            ["feed", "live"],
+            ["move", {"id": "p2", **at(5)}],
+            ["pause", SETTLED_MS],
+        ],
+        [["receive", added], ["receive", entered("p2", 1)], ["feed", "live"], ["pause", SETTLED_MS]],
+    )
+    [hello] = of(Hello, opened)
+    assert hello.snapshots
+    [resume] = of(Resume, resuming)
+    assert (resume.token, resume.snapshot) == ("t1", "newer")
+    assert [each.id for each in of(AddEmitter, gone_on)] == ["live"]
+    assert [each.id for each in of(AddListener, gone_on)] == ["p2"]
+    assert of(DryBlock, gone_on) == []
+    assert {each.index for each in of(ListenerPose, gone_on)} == {None}
+    assert {"joined": {"id": "p2"}} in there[1]
+    assert [each.id for each in of(DryBlock, there)] == ["live"]
+    assert [(each.index, each.position[0]) for each in of(ListenerPose, there)] == [(1, 5.0)]
+
+
+def test_a_snapshot_is_good_after_the_time_of_the_token_and_none_is_sent_of_another_stream(tmp_path):
+    passing = {**NEW, "resume_s": 0}
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "snapshot"}
+    _, resuming, anew = run(
+        tmp_path,
+        [["open", None], ["receive", passing], ["receive", snapshot("sealed", 0)]],
+        [["lose", 1006], ["pause", 5], ["reconnect", None], ["open", None]],
+        [["receive", forgotten], ["lose", 1008], ["open", None]],
+    )
+    [resume] = of(Resume, resuming)
+    assert (resume.token, resume.snapshot) == (None, "sealed")
+    assert len(of(Hello, anew)) == 1
+
+
+def test_a_server_that_shuts_down_is_come_back_to_when_it_says(tmp_path):
+    draining = {"type": "error", "code": "server_draining", "message": "on", "field": None, "retry_after_s": 1}
+    _, told = run(tmp_path, OPENED, [["receive", draining], ["lose", 1012]])
+    assert told[1] == [{"state": "waiting", "code": 1012, "retryMs": 1000, "isBusy": False}]
 
 
 def test_a_stream_goes_on_after_many_orders_that_the_server_has(tmp_path):

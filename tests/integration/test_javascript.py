@@ -32,7 +32,6 @@ needs_packages = pytest.mark.skipif(
 RATE = 48_000
 
 _CAPTURE = """async (seconds) => {
-  await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
   const { left, right } = await nafir.capture(seconds);
   return [left, right].map((ear) => {
     const bytes = new Uint8Array(ear.buffer);
@@ -45,6 +44,12 @@ _CAPTURE = """async (seconds) => {
 
 def listen(page, seconds: float = 1.0) -> np.ndarray:
     """(2, n) what is heard in the seconds to come."""
+    page.wait_for_timeout(1000 * seconds)
+    return heard_lately(page, seconds)
+
+
+def heard_lately(page, seconds: float) -> np.ndarray:
+    """(2, n) what was heard in the last seconds."""
     return np.array(
         [np.frombuffer(base64.b64decode(ear), np.float32) for ear in page.evaluate(_CAPTURE, seconds)], np.float64
     )

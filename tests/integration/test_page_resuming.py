@@ -1,4 +1,5 @@
-"""A lost connection costs the page a gap: its stream goes on where it would be. One that is gone begins anew."""
+"""A lost connection, or a server that starts anew, costs the page a gap: its stream goes on where it would be. One that
+nobody knows any more begins anew."""
 
 import re
 import urllib.request
@@ -51,16 +52,28 @@ def test_a_stream_goes_on_with_what_was_changed_meanwhile(browser):
             context.close()
 
 
-def test_a_stream_of_a_server_that_was_started_anew_begins_anew(browser):
+@pytest.mark.parametrize(
+    ("secret", "outcome"),
+    [
+        ({"NAFIR_RESUME_SECRET": "a secret of both", "NAFIR_SNAPSHOT_LIFETIME_S": "900"}, "resumed_from_snapshot"),
+        pytest.param({}, "unknown", marks=pytest.mark.long, id="without a secret"),
+    ],
+)
+def test_a_stream_of_a_server_that_was_started_anew_goes_on_if_there_is_a_secret(browser, secret, outcome):
     port = free_port()
     context = browser.new_context()
-    with serving(port, settings=LONG) as url:
+    with serving(port, settings={**LONG, **secret}) as url:
         page = open_page(context, url)
         start(page)
     page.wait_for_function(IS_WAITING)
-    with serving(port, settings=LONG) as url:
+    page.click("#add-source")
+    with serving(port, settings={**LONG, **secret}) as url:
         page.wait_for_function(IS_LIVE, timeout=visitor.WAIT_MS)
-        assert resumptions(url, "unknown") == 1
+        assert resumptions(url, outcome) == 1
+        page.wait_for_function("nafir.state().effects?.decisions.some(({ emitter }) => emitter === 'B')")
         page.evaluate("nafir.setListener({ yaw: 1 })")
         assert np.all(level_db(listen(page)) > -70)
+        notices = page.locator(".notice p").all_inner_texts()
+        passing = "No loudness map", "the server is still warming up"
+        assert [text for text in notices if not text.startswith(passing)] == []
         context.close()

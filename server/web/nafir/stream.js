@@ -1,6 +1,6 @@
-// A live stream that reconnects by itself. A server that has kept the stream goes on with it, and is sent what it had not got yet. Else the
-// stream begins anew with the wanted state (poses, emitters). It runs in a worker, so that drawing never delays audio. Times are epoch
-// milliseconds.
+// A live stream that reconnects by itself. A server that has kept the stream goes on with it, and so does one that takes the newest snapshot
+// of another; either is sent what it had not got yet. Else the stream begins anew with the wanted state (poses, emitters). It runs in a
+// worker, so that drawing never delays audio. Times are epoch milliseconds.
 
 import { authorized } from "./http.js";
 import { OpusReader, OpusWriter, encodesOpus } from "./opus.js";
@@ -19,10 +19,11 @@ const TAKEN_OVER = 4409; // another connection has resumed the stream
 const ENDED = 1000; // for good
 const LOST = 4000; // a connection that is given up, whose stream is to be kept
 const FORGOTTEN = "unknown_resume_token";
+const DRAINING = "server_draining";
 const NOT_KNOWN = "unknown_message"; // said by a server that is too old to have several listeners in a stream
 const NOT_THERE = "unknown_listener"; // said of one that is removed, moved or acknowledged, not of one that is added
 const ANSWER_MS = 30_000; // a listener that is not there for so long after it was asked for is given up
-const MOST_ORDERS = 256;
+const MOST_ORDERS = 1024;
 const NEEDS_KEY = 401;
 const BUSY = 503;
 
@@ -50,6 +51,7 @@ export class Stream {
   #poseId = 0;
   #lastError = null;
   #comeBackMs = null; // after which a server without room said to come back
+  #goOnMs = null; // after which one that shuts down said to go on
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
   #asking = 0; // timer that asks for them again
   #encoding = "f32";
@@ -57,11 +59,12 @@ export class Stream {
   #newOpus = () => null; // of the listener with this id, or of the first if it is null
   #packetFrames = null; // samples of a packet of live sound in Opus; null where it is sent as samples
   #writers = new Map(); // id of a live emitter -> its OpusWriter
-  #token = null; // resumes the stream
+  #token = null; // resumes the stream at the server that had it
   #resumeMs = 0; // for so long after the connection was lost
+  #snapshot = null; // the newest; resumes the stream at any server that has the same secret
   #lostAt = null; // when the connection of a stream to be resumed was lost
   #last = {}; // {sequence, sampleClock} of the last block
-  #orders = []; // the newest messages that the server counts: {text, key, isSent}, and how many there were
+  #orders = []; // the newest messages that the server counts: {text, key, adds, isSent}, and how many there were
   #ordered = 0;
   #awaiting = new Map(); // key -> message that says what changed since the hello, for when the hello is answered
   #doors = null; // names of the scene's doors, once a welcome has said them
@@ -240,11 +243,11 @@ export class Stream {
 
   #add(emitter) {
     this.#missing.add(emitter.id);
-    this.#order(message.addEmitter(emitter));
+    this.#order(message.addEmitter(emitter), null, emitter.id);
   }
 
   #askAgain() {
-    for (const id of this.#missing) this.#order(message.addEmitter(this.#emitters.get(id)));
+    for (const id of this.#missing) this.#order(message.addEmitter(this.#emitters.get(id)), null, id);
     for (const [id, { asked }] of this.#others) if (asked === null) this.#askFor(id);
   }
 
@@ -296,7 +299,17 @@ export class Stream {
 
   /** Whether there is a stream that messages are for: one with a connection, or one to be resumed. */
   get #isOpen() {
-    return this.#welcomed || this.#token !== null;
+    return this.#welcomed || this.#canResume;
+  }
+
+  get #canResume() {
+    return this.#token !== null || this.#snapshot !== null;
+  }
+
+  /** Keeps a snapshot in place of the last one. What it covers need not be sent again. */
+  #keep({ snapshot, handled }) {
+    this.#snapshot = snapshot;
+    while (this.#orders.length > 0 && this.#ordered - this.#orders.length < handled) this.#orders.shift();
   }
 
   /** Sends a message that changes what the hello says too. While a hello is not answered yet, the message waits. */
@@ -305,14 +318,15 @@ export class Stream {
     else this.#awaiting.set(key ?? text, text);
   }
 
-  /** Sends a message that changes the stream, now or when it is resumed. One that waits for that gives way to a newer one with its key. */
-  #order(text, key = null) {
+  /** Sends a message that changes the stream, now or when it is resumed. One that waits for that gives way to a newer one with its key.
+      `adds` is the id of the emitter that it adds. */
+  #order(text, key = null, adds = null) {
     const older = key === null ? -1 : this.#orders.findIndex((order) => order.key === key && !order.isSent);
     if (older >= 0) {
       this.#orders.splice(older, 1);
       this.#ordered -= 1;
     }
-    this.#orders.push({ text, key, isSent: this.#welcomed });
+    this.#orders.push({ text, key, adds, isSent: this.#welcomed });
     this.#ordered += 1;
     if (this.#orders.length > MOST_ORDERS) this.#orders.shift();
     if (this.#welcomed) this.#send(text);
@@ -320,7 +334,7 @@ export class Stream {
 
   /** Begins anew with the next connection. */
   #forget() {
-    this.#token = this.#lostAt = null;
+    this.#token = this.#snapshot = this.#lostAt = null;
     this.#last = {};
     this.#orders = [];
     this.#ordered = 0;
@@ -351,11 +365,12 @@ export class Stream {
     const socket = new WebSocket(this.#url, protocolsFor(this.#key));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      if (this.#token !== null && now() - this.#lostAt > this.#resumeMs) this.#forget();
-      if (this.#token !== null) {
-        socket.send(message.resume({ token: this.#token, ...this.#last }));
+      if (this.#token !== null && now() - this.#lostAt > this.#resumeMs) this.#token = null;
+      if (this.#canResume) {
+        socket.send(message.resume({ token: this.#token, snapshot: this.#snapshot, ...this.#last }));
         return;
       }
+      this.#forget();
       this.#awaiting.clear(); // the hello says it
       const { at, ...listener } = this.#listener;
       const listeners = Math.max(this.#hello.listeners ?? 0, this.#others.size && 1 + this.#others.size) || undefined;
@@ -406,9 +421,9 @@ export class Stream {
       this.#listeners.state({ state: "refused", reason: told, needsKey: code === ACCESS_ENDED });
       return;
     }
-    const wait = this.#comeBackMs ?? RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];
+    const wait = this.#comeBackMs ?? this.#goOnMs ?? RETRY_MS[Math.min(this.#attempt, RETRY_MS.length - 1)];
     const isBusy = this.#comeBackMs !== null;
-    this.#comeBackMs = null;
+    this.#comeBackMs = this.#goOnMs = null;
     this.#attempt += 1;
     this.#listeners.state({ state: "waiting", code, reason, retryMs: wait, isBusy });
     this.#retry = setTimeout(() => this.#connect(), wait);
@@ -422,10 +437,15 @@ export class Stream {
     else if (received.type === "plan_changed") this.#listeners.effects(received);
     else if (received.type === "emitter_added") this.#added(received.id);
     else if (received.type === "listener_added") this.#joined(received.id, received.index);
+    else if (received.type === "snapshot") this.#keep(received);
     else if (received.type === "error") {
       this.#lastError = received.code === FORGOTTEN ? FORGOTTEN : received.message;
       if (received.code === FORGOTTEN) return; // the stream begins anew
       const comeBackMs = received.retry_after_s ? 1000 * received.retry_after_s : null;
+      if (received.code === DRAINING) {
+        this.#goOnMs = comeBackMs;
+        return; // the end of the connection says so
+      }
       if (!this.#welcomed) {
         this.#comeBackMs = comeBackMs;
         if (comeBackMs !== null) return; // the state says so
@@ -494,12 +514,16 @@ export class Stream {
     for (const order of lost) {
       this.#send(order.text);
       order.isSent = true;
+      if (!this.#emitters.has(order.adds)) continue;
+      this.#missing.add(order.adds); // though it may have been heard since the snapshot
+      this.#dry.delete(order.adds);
     }
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
     const numbers = new Map(listeners.map(({ id, index }) => [id, index]));
     for (const [id, other] of this.#others) {
-      if (lost.some(({ text }) => text === other.asked)) continue; // the server is yet to have it
-      if (!numbers.has(id)) {
+      if (lost.some(({ text }) => text === other.asked)) {
+        other.number = null; // the server is yet to have it
+      } else if (!numbers.has(id)) {
         const wasThere = other.number !== null;
         other.number = null;
         if (!wasThere) this.#askFor(id); // else an error says why it is gone

@@ -126,10 +126,10 @@ export const message = {
   hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters, listeners, doors }) =>
     JSON.stringify({
       type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
-      buffer_blocks: bufferBlocks, listener, emitters, listeners, doors,
+      buffer_blocks: bufferBlocks, listener, emitters, listeners, doors, snapshots: true,
     }),
-  resume: ({ token, sequence, sampleClock }) =>
-    JSON.stringify({ type: "resume", protocol: PROTOCOL, token, sequence, sample_clock: sampleClock }),
+  resume: ({ token, snapshot, sequence, sampleClock }) =>
+    JSON.stringify({ type: "resume", protocol: PROTOCOL, token, snapshot, sequence, sample_clock: sampleClock }),
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setDoor: ({ name, openness }) => JSON.stringify({ type: "set_door", door: name, openness }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
