@@ -1,7 +1,7 @@
 // Compiled by test_javascript.py, not run: what a user writes has the types that it should.
 
 import * as THREE from "three";
-import { connect, microphone, RefusedError, type Emitter, type Latency, type Listener } from "nafir-client";
+import { connect, deleteClip, microphone, RefusedError, uploadClip, type Emitter, type Latency, type Listener } from "nafir-client";
 import { Field, type Channels } from "nafir-client/field";
 import { bind, poseOf } from "nafir-client/three";
 import { useDoor, useEmitter, useListener, useNafir } from "nafir-client/react";
@@ -14,6 +14,17 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   radio.gainDb = -6;
   nafir.addEmitter({ source: await microphone(context), position: [1, 2, 1.5], yaw: 0.5 });
   nafir.listener.yaw = 1;
+  const bell = nafir.addEmitter({
+    clip: "trumpet", position: [1, 2, 1.5], loop: false, startAt: nafir.sampleClock + 100, offsetS: 0.5, removeWhenEnded: true,
+  });
+  nafir.addEmitter({ clip: await nafir.upload(new Blob()), position: [1, 2, 1.5], loopStartS: 0.1, loopEndS: 0.2, stopAt: 48_000 });
+  nafir.addEmitter({ position: [1, 2, 1.5], jitterMs: 40 });
+  bell.setGain(-6, { rampS: 0.5 });
+  bell.stop({ fadeS: 0.5, at: 96_000 });
+  nafir.addEventListener("ended", ({ detail }) => console.log(detail.id === bell.id && detail.removed, bell.hasEnded));
+  await deleteClip("https://sound.example", await uploadClip("https://sound.example", new ArrayBuffer(8), { title: "A door" }));
+  // @ts-expect-error  a clock is a number
+  nafir.addEmitter({ clip: "trumpet", position: [1, 2, 1.5], startAt: "now" });
   for (const door of Object.keys(nafir.welcome?.doors ?? {})) nafir.setDoor(door, 0.5);
   nafir.listener.move({ position: [1, 1, 1.6], orientation: [0, 0, 0, 1] });
   nafir.addEventListener("refused", ({ detail }) => console.warn(detail.code, detail.message));

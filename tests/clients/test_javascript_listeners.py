@@ -1,4 +1,4 @@
-"""What a stream of the package for JavaScript says and tells, in Node, without a server: listeners, doors, levels."""
+"""What a stream of the package for JavaScript says and tells, in Node, without a server: listeners, clips, doors."""
 
 import json
 import shutil
@@ -14,11 +14,13 @@ from server.protocol.client_messages import (
     AddListener,
     Hello,
     ListenerPose,
+    RemoveEmitter,
     RemoveListener,
     Resume,
     SetDoor,
     SetGain,
     SetLevel,
+    StopEmitter,
     parse_client_message,
 )
 from tests.clients.test_javascript import HERE, MODULES, NODE
@@ -101,7 +103,7 @@ def test_a_listener_is_added_moved_acknowledged_and_removed(tmp_path):
     assert (pose.index, pose.position) == (7, (3.0, 1.0, 1.5))
     assert {"posed": {"poseId": pose.pose_id, "listener": "p2"}} in moved[1]
     assert of(Acknowledge, heard) == [Acknowledge(sequence=3), Acknowledge(sequence=3, listener="p2")]
-    blocks = [each["block"] for each in heard[1]]
+    blocks = [each["block"] for each in heard[1] if "block" in each]
     assert [(each["id"], each["sequence"]) for each in blocks[:3]] == [(None, 0), ("p2", 0), (None, 1)]
     assert {each["id"]: each["first"] for each in blocks} == {None: 1 / 8, "p2": 1.0}
     assert of(RemoveListener, removed) == [RemoveListener(id="p2")]
@@ -337,6 +339,86 @@ def test_an_old_server_refuses_a_listener_without_naming_it(tmp_path):
     assert [each["left"]["id"] for each in refused[1] if "left" in each] == ["p3"]
     assert of(RemoveListener, refused) == [RemoveListener(id="p3")]
     assert [each["block"]["id"] for each in refused[1] if "block" in each] == ["p2"]
+
+
+def clip(identifier, **more):
+    return ["emitter", {"id": identifier, "clip": "bell", **at(2), **more}]
+
+
+def heard(identifier):
+    return ["receive", {"type": "emitter_added", "id": identifier, "sample_clock": 0}]
+
+
+def test_clips_start_and_stop_at_clocks_and_gains_ramp(tmp_path):
+    times = {"startAt": 4_800.4, "stopAt": 9_600, "offsetS": 0.5, "loopStartS": 0.25, "loopEndS": 1}
+    _, added, changed, live = run(
+        tmp_path,
+        OPENED,
+        [clip("bell", **times, removeWhenEnded=True)],
+        [
+            clip("bell", **times, gainDb=-6, rampS=0.5),
+            ["stop", {"id": "bell", "at": 7_200, "fadeS": 0.2}],
+            ["stop", {"id": "nobody", "fadeS": 0.2}],
+        ],
+        [["emitter", {"id": "microphone", "live": True, "jitterMs": 40, **at(2)}]],
+    )
+    [bell] = of(AddEmitter, added)
+    assert (bell.start_at, bell.stop_at, bell.offset_s, bell.loop_start_s, bell.loop_end_s, bell.remove_when_ended) == (
+        4_800,
+        9_600,
+        0.5,
+        0.25,
+        1,
+        True,
+    )
+    assert of(SetGain, changed) == [SetGain(id="bell", gain_db=-6, ramp_s=0.5)]
+    assert of(StopEmitter, changed) == [StopEmitter(id="bell", stop_at=7_200, fade_s=0.2)]
+    assert [each.jitter_ms for each in of(AddEmitter, live)] == [40]
+
+
+def ended(identifier, removed):
+    return {"type": "emitter_ended", "id": identifier, "sample_clock": 0, "removed": removed}
+
+
+def test_the_end_of_a_clip_is_told_and_one_that_is_removed_is_not_moved_any_more(tmp_path):
+    _, told, moved = run(
+        tmp_path,
+        OPENED,
+        [
+            *[clip(name, loop=False) for name in ("bell", "horn")],
+            *[["receive", ended(name, name == "bell")] for name in ("bell", "horn")],
+        ],
+        [["removeEmitter", "bell"], ["removeEmitter", "horn"]],
+    )
+    assert [each["ended"] for each in told[1] if "ended" in each] == [
+        {"id": "bell", "removed": True},
+        {"id": "horn", "removed": False},
+    ]
+    assert of(RemoveEmitter, moved) == [RemoveEmitter(id="horn")]
+
+
+def test_a_new_stream_goes_on_with_the_clock_and_begins_no_clip_again_that_plays_once(tmp_path):
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
+    begun = [heard(name) for name in ("loop", "once", "stopped")]
+    _, _, anew, there = run(
+        tmp_path,
+        OPENED,
+        [
+            *[clip("loop"), clip("once", loop=False), clip("stopped"), clip("waiting", loop=False, startAt=48_000)],
+            *begun,
+            ["stop", {"id": "stopped", "fadeS": 0.1}],
+            *[["receive", block_of(0, sequence, 128 * sequence)] for sequence in range(17)],
+        ],
+        [*LOST, ["receive", forgotten], ["lose", 1008], ["open", None]],
+        [["receive", NEW], ["receive", block_of(0, 0, 0)], ["pause", SETTLED_MS]],
+    )
+    assert [each["ended"]["id"] for each in anew[1] if "ended" in each] == ["once", "stopped"]
+    [loop, waiting] = of(AddEmitter, there)
+    [clock] = [each["clock"] for each in there[1] if "clock" in each]
+    assert (loop.id, waiting.id) == ("loop", "waiting")
+    # 17 blocks of 128 were heard, and blocks of the new stream come after that, by the server's own clock from 0 on.
+    assert clock >= 18 * 128
+    assert waiting.start_at == 48_000 - (clock - 128)
 
 
 WITH_DOORS = {**NEW, "doors": {"kitchen": 0.0}}

@@ -61,7 +61,7 @@ def test_a_clip_is_heard_from_its_start_and_no_block_is_missing(served):
 def test_what_is_written_to_a_live_emitter_comes_back(served, encoding):
     async def perform():
         async with connect(served, encoding=encoding) as stream:
-            live = await stream.add_emitter(ahead_blocks=8)
+            live = await stream.add_emitter(ahead_blocks=8, jitter_ms=30)
             before = await blocks_of(stream, 4)
             noise = np.random.default_rng(1).standard_normal(12_000).astype(np.float32) / 10
             writing = asyncio.create_task(live.write(noise))
@@ -120,6 +120,8 @@ def test_what_is_refused_says_which_field_and_the_stream_goes_on(served):
                 {"clip": "trumpet", "id": "there"},
                 {"clip": "trumpet", "id": "c", "directivity": {"pattern": "odd"}},
                 {"clip": "trumpet", "id": "d", "gain_db": 1_000},
+                {"clip": "trumpet", "id": "e", "jitter_ms": 30},
+                {"id": "f", "jitter_ms": 1_000},
             ):
                 with pytest.raises(RefusedError) as refused:
                     await stream.add_emitter(**wish)
@@ -134,6 +136,8 @@ def test_what_is_refused_says_which_field_and_the_stream_goes_on(served):
         ("duplicate_emitter", "id"),
         ("malformed_directivity", "directivity.pattern"),
         ("malformed_message", "gain_db"),
+        ("malformed_message", "jitter_ms"),
+        ("malformed_message", "jitter_ms"),
     ]
     assert len(blocks) == 10
 

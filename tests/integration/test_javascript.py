@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 
 from server.field.fields_by_level import FieldsByLevel
 from server.protocol.codecs import libopus
@@ -188,6 +189,44 @@ def test_a_connection_that_is_made_again_has_its_listeners_where_they_are_by_the
         assert page.evaluate("[...first.listeners.keys()]") == ["listener-2", "late"]
         assert page.evaluate("refusals") == []
         context.close()
+
+
+def test_a_file_that_is_uploaded_is_played_once_from_a_clock_on_and_its_end_is_told(browser, bundle, hrtfs, tmp_path):
+    soundfile.write(tmp_path / "tone.wav", 0.5 * np.sin(2 * np.pi * 1000 * np.arange(RATE) / RATE), RATE)
+    given = list((tmp_path / "tone.wav").read_bytes())
+    with serving(FieldsByLevel.load(bundle), hrtfs, clips_folder=tmp_path / "clips") as address:
+        context = browser.new_context()
+        page = empty_page(context, f"http://{address}")
+        connect(page, scene="flat", listener={"position": [2.5, 2.0, 1.5]})
+        page.wait_for_function("nafir.sampleClock > 0")
+        ended = page.evaluate(
+            """async (bytes) => {
+              window.tone = await nafir.upload(new Blob([new Uint8Array(bytes)]), { title: "A tone" });
+              const begins = nafir.sampleClock + 24_000;
+              const once = { loop: false, removeWhenEnded: true, startAt: begins, offsetS: 0.5 };
+              const emitter = nafir.addEmitter({ clip: tone, position: [3, 2, 1.5], ...once });
+              const told = await new Promise((resolve) => nafir.addEventListener("ended", resolve, { once: true }));
+              const afterS = (nafir.sampleClock - begins) / 48_000;
+              return { ...told.detail, hasEnded: emitter.hasEnded, afterS, size: nafir.emitters.size };
+            }""",
+            given,
+        )
+        heard = heard_lately(page, 3.0)[0]
+        again = page.evaluate("""async () => {
+          const loop = nafir.addEmitter({ clip: tone, position: [3, 2, 1.5], loopStartS: 0.25, loopEndS: 0.75 });
+          loop.setGain(-20, { rampS: 0.1 });
+          loop.stop({ fadeS: 0.2 });
+          const { detail } = await new Promise((resolve) => nafir.addEventListener("ended", resolve, { once: true }));
+          await nafir.deleteClip(tone);
+          const refused = await nafir.deleteClip(tone).catch(({ name, code }) => `${name} ${code}`);
+          return { ...detail, refused, refusals };
+        }""")
+        context.close()
+    assert (ended["removed"], ended["hasEnded"], ended["size"]) == (True, True, 0)
+    assert ended["afterS"] > 0.4  # half a second of it is played
+    spectrum = np.abs(np.fft.rfft(heard * np.hanning(len(heard))))
+    assert np.argmax(spectrum) * RATE / len(heard) == pytest.approx(1000, abs=3)
+    assert (again["removed"], again["refused"], again["refusals"]) == (False, "Error unknown_clip", [])
 
 
 def test_the_sound_of_a_node_is_heard_from_its_place(page):

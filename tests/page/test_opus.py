@@ -129,7 +129,7 @@ SPEAK = """async ({ encoding, opus, blocks, withoutEncoder, failAt }) => {
     listener: { position: [2, 2, 1.5], at: now() },
     emitters: [{ id: "voice", live: true, position: [3, 2, 1.5], at: now() }],
     listeners: {
-      ...Object.fromEntries(["block", "posed", "status", "level", "effects"].map((name) => [name, ignore])),
+      ...Object.fromEntries(["block", "clock", "posed", "status", "level", "effects"].map((name) => [name, ignore])),
       refused: ({ code }) => refused.push(code),
       state: ({ state }) => (isLive ||= state === "live"),
     },

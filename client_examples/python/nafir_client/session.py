@@ -86,7 +86,8 @@ class EmitterOptions(TypedDict, total=False):
     """What may be said of an emitter when it is added.
 
     With a `clip` it plays one of the server's, with `loop` (the default) again and again. Without one it is live: it
-    plays what is written to it, of which `ahead_blocks` (4) are kept waiting at the server. Without a `position` it is
+    plays what is written to it, of which `ahead_blocks` (4) are kept waiting at the server, which lets samples wait for
+    `jitter_ms` (2 to 250; two blocks unless given), so that they may come unevenly. Without a `position` it is
     where the scene suggests. `yaw` or `orientation` turn it, which matters with a `directivity` only. `id` is its name
     in messages of the server; without one it gets one.
 
@@ -104,6 +105,7 @@ class EmitterOptions(TypedDict, total=False):
     directivity: Mapping[str, Any]
     id: str
     ahead_blocks: int
+    jitter_ms: float
     start_at: int
     stop_at: int
     offset_s: float

@@ -497,6 +497,8 @@ class Stream:
             fields["gain_db"] = options["gain_db"]
         if "directivity" in options:
             fields["directivity"] = dict(options["directivity"])
+        if "jitter_ms" in options:
+            fields["jitter_ms"] = options["jitter_ms"]
         clip = options.get("clip")
         if clip is not None:
             fields.update({name: options[name] for name in _OF_CLIPS if name in options})

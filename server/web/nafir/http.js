@@ -44,6 +44,20 @@ export const fetchJson = async (url, options = {}) => (await answered(url, optio
 /** The file at `url` as a Uint8Array. Throws as fetchJson. */
 export const fetchBytes = async (url, options = {}) => new Uint8Array(await (await answered(url, options)).arrayBuffer());
 
+/** Stores an audio file (a Blob, ArrayBuffer or typed array) on a server. Resolves with the name by which an emitter plays it as its clip. Throws as
+    fetchJson. */
+export async function uploadClip(server, file, { title, key = null, signal } = {}) {
+  const url = new URL("clips", apiOf(server));
+  if (title) url.searchParams.set("title", title);
+  const headers = { "Content-Type": "application/octet-stream" };
+  return (await fetchJson(url, { method: "POST", body: file, headers, key, signal })).name;
+}
+
+/** Deletes an uploaded clip. Emitters that play it go on. Throws as fetchJson. */
+export async function deleteClip(server, name, { key = null, signal } = {}) {
+  await answered(new URL(`clips/${encodeURIComponent(name)}`, apiOf(server)), { method: "DELETE", key, signal });
+}
+
 /** Where the filters are by which a head hears ambisonic channels: {hrtf, order, sample_rate, delay_samples, filters[ear][channel]}. `base` is the
     address of v1/. */
 export function decoderUrl(base, head, { order, sampleRate }) {

@@ -89,7 +89,18 @@ export interface Emitter extends Placed {
   /** Takes the sound of a live emitter; null if it plays a clip of the server. */
   readonly input: AudioNode | null;
   gainDb: number;
+  /** Changes its gain by a ramp of so many seconds, linearly in decibels. */
+  setGain(gainDb: number, options?: { rampS?: number }): void;
+  /** Lets its clip fade out within `fadeS` seconds (0.01), from the clock `at` of the stream on or at once. The event "ended" follows. */
+  stop(options?: StopOptions): void;
+  /** Whether all sound of its clip has been heard. */
+  readonly hasEnded: boolean;
   remove(): void;
+}
+
+export interface StopOptions {
+  at?: number;
+  fadeS?: number;
 }
 
 /** A listener beside the first of its stream. */
@@ -118,6 +129,19 @@ export interface EmitterOptions extends Pose {
   source?: AudioNode;
   /** Whether a clip is played again and again; true if left out. */
   loop?: boolean;
+  /** The clock of the stream (`sampleClock`) at which its clip begins, to the sample; at once if left out or over. */
+  startAt?: number;
+  /** The clock at which its clip fades out. */
+  stopAt?: number;
+  /** Where in its clip to begin, in seconds. */
+  offsetS?: number;
+  /** What of its clip is repeated, in seconds. */
+  loopStartS?: number;
+  loopEndS?: number;
+  /** Whether it is removed once all of its sound has been heard. */
+  removeWhenEnded?: boolean;
+  /** For how long samples of a live emitter wait at the server, so that they may come unevenly: 2 to 250 milliseconds, two blocks if left out. */
+  jitterMs?: number;
   gainDb?: number;
   directivity?: Directivity;
 }
@@ -128,6 +152,8 @@ interface NafirEvents {
   level: CustomEvent<{ level: string; reason: string; listener?: string; [more: string]: unknown }>;
   effects: CustomEvent<{ decisions: readonly unknown[]; listener?: string; [more: string]: unknown }>;
   status: CustomEvent<{ listener?: string; [figure: string]: unknown }>;
+  /** All sound of an emitter's clip has been heard. It is removed if it was to be, or if a new stream does not begin it again. */
+  ended: CustomEvent<{ id: string; removed: boolean }>;
   /** A listener beside the first is gone, since a new connection may not have it again. */
   left: CustomEvent<{ id: string; code: string; message: string }>;
 }
@@ -144,6 +170,14 @@ export interface Nafir extends EventTarget {
   readonly emitters: ReadonlyMap<string, Emitter>;
   addEmitter(options: EmitterOptions): Emitter;
   removeEmitter(id: string): void;
+  /** As `stop` of an emitter. */
+  stopEmitter(id: string, options?: StopOptions): void;
+  /** The clock that the stream has reached by now, in samples: about that of the frame after its newest block. It goes on over lost connections. */
+  readonly sampleClock: number;
+  /** Stores an audio file on the server. Resolves with the name by which an emitter plays it as its clip. Rejects with RequestError. */
+  upload(file: Blob | BufferSource, options?: { title?: string }): Promise<string>;
+  /** Deletes an uploaded clip. Emitters that play it go on. */
+  deleteClip(name: string): Promise<void>;
   /** Adds a listener who hears the same emitters at the same time. Rejects with RefusedError if the server does not take it or it is not there within
       30 s, and with RangeError for an id or numbers that no server takes; the stream goes on. */
   addListener(options?: ListenerOptions): Promise<Listener>;
@@ -213,6 +247,17 @@ export class RequestError extends Error {
 
 /** Opens a stream of a server and makes an AudioNode of it. Resolves when the server has welcomed it. */
 export function connect(context: AudioContext, url: string | URL, options: ConnectOptions): Promise<Nafir>;
+
+export interface RequestOptions {
+  key?: string | null;
+  signal?: AbortSignal;
+}
+
+/** Stores an audio file on a server, without a stream. Resolves with the name of the clip. Rejects with RequestError. */
+export function uploadClip(server: string | URL, file: Blob | BufferSource, options?: RequestOptions & { title?: string }): Promise<string>;
+
+/** Deletes an uploaded clip of a server. */
+export function deleteClip(server: string | URL, name: string, options?: RequestOptions): Promise<void>;
 
 /** An AudioNode with the sound of a microphone. Asks the user. */
 export function microphone(context: AudioContext, constraints?: MediaTrackConstraints): Promise<MediaStreamAudioSourceNode>;

@@ -8,7 +8,7 @@
 // Positions are [x, y, z] in metres (x east, y north, z up), orientations quaternions [x, y, z, w] whose identity looks along +x.
 
 import { LocalWorkerStream } from "./field/local_worker_stream.js";
-import { apiOf, decoderUrl, fetchJson } from "./http.js";
+import { apiOf, decoderUrl, deleteClip, fetchJson, uploadClip } from "./http.js";
 import { PoseLedger } from "./latency.js";
 import { decodesOpus } from "./opus.js";
 import { Output } from "./output.js";
@@ -16,7 +16,7 @@ import { now } from "./stream.js";
 import { orientationOf } from "./wire.js";
 import { WorkerStream } from "./worker_stream.js";
 
-export { RequestError } from "./http.js";
+export { RequestError, deleteClip, uploadClip } from "./http.js";
 export { microphone } from "./microphone.js";
 export { Output } from "./output.js";
 export { WorkerStream } from "./worker_stream.js";
@@ -116,14 +116,19 @@ class Placed {
 class Emitter extends Placed {
   #nafir;
   #gainDb;
+  #changed;
 
-  constructor(nafir, { id, input = null, gainDb = 0, ...pose }, moved) {
-    super(pose, moved);
+  /** `changed({ rampS })` sends what it is now; by a ramp of its gain, if one is given. */
+  constructor(nafir, { id, input = null, gainDb = 0, ...pose }, changed) {
+    super(pose, changed);
     this.#nafir = nafir;
     this.#gainDb = gainDb;
+    this.#changed = changed;
     this.id = id;
     /** The AudioNode that takes the sound of a live emitter; null if it plays a clip of the server. */
     this.input = input;
+    /** Whether all sound of its clip has been heard. */
+    this.hasEnded = false;
   }
 
   get gainDb() {
@@ -131,8 +136,18 @@ class Emitter extends Placed {
   }
 
   set gainDb(gainDb) {
+    this.setGain(gainDb);
+  }
+
+  /** Changes its gain by a ramp of so many seconds, linearly in decibels. */
+  setGain(gainDb, { rampS } = {}) {
     this.#gainDb = gainDb;
-    this.move({});
+    this.#changed({ rampS });
+  }
+
+  /** Lets its clip fade out within `fadeS` seconds, from the clock `at` of the stream on or at once. The event "ended" follows. */
+  stop({ at, fadeS = 0.01 } = {}) {
+    this.#nafir.stopEmitter(this.id, { at, fadeS });
   }
 
   remove() {
@@ -172,7 +187,8 @@ class Listener extends Placed {
 /**
  * A stream in an AudioContext. Events: "state" (detail: {state, ...}; connecting, live, waiting, refused or closed), "refused" (detail: an
  * error of the server, after which the stream goes on), "level", "effects", "status" (details: those messages, with the id of a `listener`
- * beside the first), "left" (detail: {id, code, message} of a listener whom a new connection may not have again).
+ * beside the first), "ended" (detail: {id, removed} of an emitter all of whose clip has been heard, and that is removed if it was to be, or
+ * if a new stream does not begin it again), "left" (detail: {id, code, message} of a listener whom a new connection may not have again).
  */
 class Nafir extends EventTarget {
   #stream;
@@ -182,6 +198,7 @@ class Nafir extends EventTarget {
   #options;
   #emitters = new Map(); // id -> {emitter, source}
   #hearing;
+  #clock = null; // {sampleClock, at}
   #others = new Map(); // id -> {listener, hearing, settle}: listeners beside the first. `settle` takes the end of their addListener
   #filters = new Map(); // of heads for ambisonics, by name: promises
   #count = 0;
@@ -207,6 +224,14 @@ class Nafir extends EventTarget {
       const { listener, ...pose } = detail;
       if (listener === undefined) this.#hearing.posed(pose);
       else this.#others.get(listener)?.hearing.posed(pose);
+    });
+    stream.addEventListener("clock", ({ detail }) => (this.#clock = detail));
+    stream.addEventListener("ended", ({ detail }) => {
+      const known = this.#emitters.get(detail.id);
+      if (!known) return; // removed meanwhile
+      known.emitter.hasEnded = true;
+      if (detail.removed) this.#emitters.delete(detail.id);
+      this.dispatchEvent(new CustomEvent("ended", { detail: { id: detail.id, removed: detail.removed } }));
     });
     stream.addEventListener("joined", ({ detail }) => {
       const other = this.#others.get(detail.id);
@@ -341,16 +366,31 @@ class Nafir extends EventTarget {
     return new Map([...this.#others].map(([id, { listener }]) => [id, listener]));
   }
 
+  /** The clock that the stream has reached by now, in samples: about that of the frame after its newest block. It goes on over lost
+      connections. 0 before the first block, and where the scene is rendered here. */
+  get sampleClock() {
+    if (this.#clock === null) return 0;
+    const { sampleClock, at } = this.#clock;
+    return sampleClock + Math.round(((now() - at) * this.welcome.sample_rate) / 1000);
+  }
+
   /**
    * Adds an emitter that plays a `clip` of the server (one of GET /v1/clips, again and again unless `loop` is false) or, without one, the
    * sound of an AudioNode: give it as `source`, or connect it to the emitter's `input`.
+   *
+   * A clip begins at the clock `startAt` of the stream (`sampleClock`), to the sample, or at once, `offsetS` seconds into it; a loop goes from
+   * `loopStartS` to `loopEndS`. It fades out at the clock `stopAt`. With `removeWhenEnded` its emitter is removed once all of its sound has
+   * been heard. Live samples wait at the server for `jitterMs`, 2 to 250, by default for two blocks. Where the scene is rendered here, clips
+   * are played from their start, and these options are ignored. What the server does not take ends in the event "refused".
    */
   addEmitter({ id = `emitter-${++this.#count}`, clip, source, loop, directivity, ...rest }) {
     if (this.#emitters.has(id)) throw new Error(`there is an emitter ${id} already`);
-    const sound = clip === undefined ? { live: true } : { clip, loop };
+    const { jitterMs, startAt, stopAt, offsetS, loopStartS, loopEndS, removeWhenEnded } = rest;
+    const played = { clip, loop, startAt, stopAt, offsetS, loopStartS, loopEndS, removeWhenEnded };
+    const sound = clip === undefined ? { live: true, jitterMs } : played;
     const tap = clip === undefined ? this.#tap(id) : null;
     const input = tap?.node ?? null;
-    const emitter = new Emitter(this, { id, input, ...rest }, () => this.#emitterMoved(id));
+    const emitter = new Emitter(this, { id, input, ...rest }, (change) => this.#emitterMoved(id, change));
     this.#emitters.set(id, { emitter, tap, sound: { ...sound, directivity } });
     source?.connect(input);
     this.#emitterMoved(id);
@@ -363,11 +403,19 @@ class Nafir extends EventTarget {
     return tap;
   }
 
-  #emitterMoved(id) {
+  #emitterMoved(id, { rampS } = {}) {
     const known = this.#emitters.get(id);
     if (!known) return; // removed
     const { position, orientation, gainDb } = known.emitter;
-    this.#stream.tell("emitter", { id, ...known.sound, position, orientation, gainDb, at: now() });
+    this.#stream.tell("emitter", { id, ...known.sound, position, orientation, gainDb, rampS, at: now() });
+  }
+
+  /** As `stop` of an emitter. */
+  stopEmitter(id, { at, fadeS = 0.01 } = {}) {
+    const known = this.#emitters.get(id);
+    if (!known || known.tap) return;
+    known.sound.loop = false; // what was stopped is not begun again by a new stream
+    this.#stream.tell("stop", { id, at, fadeS });
   }
 
   removeEmitter(id) {
@@ -381,6 +429,16 @@ class Nafir extends EventTarget {
   /** All emitters, by id. */
   get emitters() {
     return new Map([...this.#emitters].map(([id, { emitter }]) => [id, emitter]));
+  }
+
+  /** Stores an audio file (a Blob) on the server. Resolves with the name by which an emitter plays it as its clip. Rejects with RequestError. */
+  upload(file, { title } = {}) {
+    return uploadClip(this.#api, file, { title, key: this.#options.key ?? null });
+  }
+
+  /** Deletes an uploaded clip. Emitters that play it go on. Rejects with RequestError. */
+  deleteClip(name) {
+    return deleteClip(this.#api, name, { key: this.#options.key ?? null });
   }
 
   /** Chooses a quality level of the scene, or "auto". */

@@ -24,6 +24,7 @@ const NOT_KNOWN = "unknown_message"; // said by a server that is too old to have
 const NOT_THERE = "unknown_listener"; // said of one that is removed, moved or acknowledged, not of one that is added
 const ANSWER_MS = 30_000; // a listener that is not there for so long after it was asked for is given up
 const MOST_ORDERS = 1024;
+const CLOCK_EVERY = 16; // blocks
 const NEEDS_KEY = 401;
 const BUSY = 503;
 
@@ -64,12 +65,16 @@ export class Stream {
   #snapshot = null; // the newest; resumes the stream at any server that has the same secret
   #lostAt = null; // when the connection of a stream to be resumed was lost
   #last = {}; // {sequence, sampleClock} of the last block
+  #clockOffset = 0; // what is added to the server's clock, which begins at 0 with each new stream
+  #nextClock = 0; // of the frame after the first listener's newest block, and when that came
+  #clockAt = 0;
   #orders = []; // the newest messages that the server counts: {text, key, adds, isSent}, and how many there were
   #ordered = 0;
   #awaiting = new Map(); // key -> message that says what changed since the hello, for when the hello is answered
   #doors = null; // names of the scene's doors, once a welcome has said them
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
+  #heard = new Set(); // ids of emitters that the server has said are heard
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
   #others = new Map(); // id -> listener beside the first: {position, orientation, head, at} and what `#entered` adds
   #dirty = new Set(); // "listener" and ids of emitters and other listeners that moved since they were last sent
@@ -80,7 +85,8 @@ export class Stream {
   /**
    * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block, id), state({state, ...}),
    * posed({poseId, at, listener}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}),
-   * joined({id}) and left({id, code, message}). `id` and `listener` are those of a listener beside the first: `joined` says that its blocks
+   * clock({sampleClock, at}), ended({id, removed}), joined({id}) and left({id, code, message}). `ended` says that all sound of an emitter's
+   * clip has been heard, and whether the emitter is removed for that. Clocks go on over lost connections. `id` and `listener` are those of a listener beside the first: `joined` says that its blocks
    * begin, in each new stream, and `left` that it was refused, or was not there in time (its code is null then), and is not asked for again.
    */
   constructor({ url, key = null, hello, listener, emitters, listeners }) {
@@ -115,6 +121,14 @@ export class Stream {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();
     }
+  }
+
+  /** Lets the clip of an emitter fade out within `fadeS` seconds, from the clock `at` on or at once. */
+  stopEmitter({ id, at, fadeS }) {
+    const emitter = this.#emitters.get(id);
+    if (!emitter) return;
+    this.#emitters.set(id, { ...emitter, loop: false }); // what was stopped is not begun again by a new stream
+    if (this.#isOpen) this.#order(message.stopEmitter({ id, stopAt: this.#serverClock(at), fadeS }));
   }
 
   /** Adds a listener beside the first, who hears the same emitters: {id, position, orientation, head, at}. */
@@ -190,12 +204,22 @@ export class Stream {
   }
 
   removeEmitter(id) {
-    if (!this.#emitters.delete(id)) return;
+    if (this.#dropEmitter(id) && this.#isOpen) this.#order(message.removeEmitter(id));
+  }
+
+  /** Forgets an emitter. Returns whether it was known. */
+  #dropEmitter(id) {
     this.#dry.delete(id);
     this.#endWriter(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
-    if (this.#isOpen) this.#order(message.removeEmitter(id));
+    this.#heard.delete(id);
+    return this.#emitters.delete(id);
+  }
+
+  #ended({ id, removed }) {
+    if (removed) this.#dropEmitter(id);
+    this.#listeners.ended({ id, removed });
   }
 
   setLevel(level) {
@@ -242,12 +266,18 @@ export class Stream {
   }
 
   #add(emitter) {
+    const { startAt, stopAt } = emitter;
     this.#missing.add(emitter.id);
-    this.#order(message.addEmitter(emitter), null, emitter.id);
+    const clocks = { startAt: this.#serverClock(startAt), stopAt: this.#serverClock(stopAt) };
+    this.#order(message.addEmitter({ ...emitter, ...clocks }), null, emitter.id);
+  }
+
+  #serverClock(clock) {
+    return clock === undefined ? undefined : Math.max(0, Math.round(clock) - this.#clockOffset);
   }
 
   #askAgain() {
-    for (const id of this.#missing) this.#order(message.addEmitter(this.#emitters.get(id)), null, id);
+    for (const id of this.#missing) this.#add(this.#emitters.get(id));
     for (const [id, { asked }] of this.#others) if (asked === null) this.#askFor(id);
   }
 
@@ -343,6 +373,12 @@ export class Stream {
     for (const other of this.#others.values()) other.number = other.asked = null;
   }
 
+  /** What plays once and was heard is not begun again by a new stream. */
+  #endPlayed() {
+    for (const [id, { live, loop = true }] of this.#emitters) if (!live && !loop && this.#heard.has(id)) this.#ended({ id, removed: true });
+    this.#heard.clear();
+  }
+
   /** Leaves the connection with a close code. */
   #detach(code) {
     clearTimeout(this.#asking);
@@ -371,6 +407,7 @@ export class Stream {
         return;
       }
       this.#forget();
+      this.#endPlayed();
       this.#awaiting.clear(); // the hello says it
       const { at, ...listener } = this.#listener;
       const listeners = Math.max(this.#hello.listeners ?? 0, this.#others.size && 1 + this.#others.size) || undefined;
@@ -436,6 +473,7 @@ export class Stream {
     else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "plan_changed") this.#listeners.effects(received);
     else if (received.type === "emitter_added") this.#added(received.id);
+    else if (received.type === "emitter_ended") this.#ended(received);
     else if (received.type === "listener_added") this.#joined(received.id, received.index);
     else if (received.type === "snapshot") this.#keep(received);
     else if (received.type === "error") {
@@ -466,6 +504,7 @@ export class Stream {
 
   #added(id) {
     this.#missing.delete(id);
+    if (this.#emitters.has(id)) this.#heard.add(id);
     if (this.#emitters.get(id)?.live) this.#dry.set(id, 0);
   }
 
@@ -475,6 +514,7 @@ export class Stream {
       return;
     }
     this.#welcomed = true;
+    if (!welcome.resumed && this.#nextClock > 0) this.#clockOffset = this.#continued(welcome);
     this.#encoding = welcome.encoding;
     // A browser that fails at Opus gets samples.
     const fail = () => this.renew({ encoding: "s16", opus: undefined });
@@ -507,6 +547,12 @@ export class Stream {
     }, REST_MS);
   }
 
+  /** The clock at which a new stream of the server's begins: as much later as there was none. A block comes so many blocks before its time. */
+  #continued({ sample_rate: rate, block_size: blockSize, buffer_blocks: buffered }) {
+    const away = ((now() - this.#clockAt) * rate) / 1000 - buffered * blockSize;
+    return this.#nextClock + blockSize * Math.max(0, Math.ceil(away / blockSize));
+  }
+
   /** Sends what the server had not got when the connection was lost, and where everything is now. */
   #goOn({ handled, listeners = [] }) {
     const missed = Math.max(0, this.#ordered - handled);
@@ -516,6 +562,7 @@ export class Stream {
       order.isSent = true;
       if (!this.#emitters.has(order.adds)) continue;
       this.#missing.add(order.adds); // though it may have been heard since the snapshot
+      this.#heard.delete(order.adds);
       this.#dry.delete(order.adds);
     }
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
@@ -541,12 +588,19 @@ export class Stream {
     const { header: block, packets } = this.#opus ? parsePackets(buffer) : { header: parseBlock(buffer, this.#encoding), packets: null };
     const { sequence = 0, sampleClock = 0 } = this.#last;
     this.#last = { sequence: Math.max(sequence, block.sequence), sampleClock: Math.max(sampleClock, block.sampleClock) }; // of all listeners
+    if (block.number === 0) this.#noteClock(block);
     const [id, opus] = block.number === 0 ? [null, this.#opus] : this.#numbered(block.number);
     if (id === undefined) return; // of a listener that was removed meanwhile
     if (block.sequence % ACKNOWLEDGE_EVERY === ACKNOWLEDGE_EVERY - 1) this.#send(message.acknowledge(block.sequence, id ?? undefined));
     const told = { ...block, late: (block.flags & FLAG_LATE) !== 0 };
     if (packets) opus.read(told, packets, (block.flags & FLAG_RESTART) !== 0);
     else this.#listeners.block(told, id);
+  }
+
+  #noteClock({ sequence, sampleClock, frames }) {
+    this.#nextClock = sampleClock + frames + this.#clockOffset;
+    this.#clockAt = now();
+    if (sequence % CLOCK_EVERY === 0) this.#listeners.clock({ sampleClock: this.#nextClock, at: this.#clockAt });
   }
 
   /** The id and the reader of the listener beside the first with this number; nothing if there is none. */

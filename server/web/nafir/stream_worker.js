@@ -34,6 +34,11 @@ function open({ url, key, hello, listener, emitters, port }) {
       level: tell("level"),
       effects: tell("effects"),
       refused: tell("refused"),
+      clock: tell("clock"),
+      ended(detail) {
+        if (detail.removed) untap(detail.id);
+        self.postMessage({ type: "ended", detail });
+      },
       joined(detail) {
         restart(detail.id);
         self.postMessage({ type: "joined", detail });
@@ -55,6 +60,11 @@ function tap({ id, port }) {
   port.onmessage = ({ data: samples }) => stream?.feed(id, samples);
 }
 
+function untap(id) {
+  taps.get(id)?.close();
+  taps.delete(id);
+}
+
 const commands = {
   open,
   tap,
@@ -69,10 +79,10 @@ const commands = {
     ports.delete(id);
   },
   emitter: (detail) => stream?.setEmitter(detail),
+  stop: (detail) => stream?.stopEmitter(detail),
   remove({ id }) {
     stream?.removeEmitter(id);
-    taps.get(id)?.close();
-    taps.delete(id);
+    untap(id);
   },
   door: (detail) => stream?.setDoor(detail),
   level: ({ name }) => stream?.setLevel(name),

@@ -133,9 +133,15 @@ export const message = {
   setEffects: ({ effects, output }) => JSON.stringify({ type: "set_effects", effects, output }),
   setDoor: ({ name, openness }) => JSON.stringify({ type: "set_door", door: name, openness }),
   setLevel: (level) => JSON.stringify({ type: "set_level", level }),
-  addEmitter: ({ id, clip, live, loop, position, orientation, directivity, gainDb }) =>
-    JSON.stringify({ type: "add_emitter", id, clip, live, loop, position, orientation, directivity, gain_db: gainDb }),
-  setGain: ({ id, gainDb }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb }),
+  addEmitter: ({
+    id, clip, live, loop, position, orientation, directivity, gainDb, startAt, stopAt, offsetS, loopStartS, loopEndS, removeWhenEnded, jitterMs,
+  }) =>
+    JSON.stringify({
+      type: "add_emitter", id, clip, live, loop, position, orientation, directivity, gain_db: gainDb, start_at: startAt, stop_at: stopAt,
+      offset_s: offsetS, loop_start_s: loopStartS, loop_end_s: loopEndS, remove_when_ended: removeWhenEnded, jitter_ms: jitterMs,
+    }),
+  setGain: ({ id, gainDb, rampS }) => JSON.stringify({ type: "set_gain", id, gain_db: gainDb, ramp_s: rampS }),
+  stopEmitter: ({ id, stopAt, fadeS }) => JSON.stringify({ type: "stop_emitter", id, stop_at: stopAt, fade_s: fadeS }),
   moveEmitter: ({ id, position, orientation, poseId }) => JSON.stringify({ type: "move_emitter", id, position, orientation, pose_id: poseId }),
   removeEmitter: (id) => JSON.stringify({ type: "remove_emitter", id }),
   addListener: ({ id, head, position, orientation }) => JSON.stringify({ type: "add_listener", id, hrtf: head, position, orientation }),

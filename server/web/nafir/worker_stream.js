@@ -1,5 +1,5 @@
 // A Stream in a worker of its own, seen from the page. Its events are the callbacks of Stream: "state", "posed", "status", "level",
-// "effects", "refused", "joined" and "left", each with its detail, and "failed" (detail: a message) if the worker could not be loaded.
+// "effects", "refused", "clock", "ended", "joined" and "left", each with its detail, and "failed" (detail: a message) if the worker could not be loaded.
 
 export class WorkerStream extends EventTarget {
   #worker;
