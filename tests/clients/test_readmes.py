@@ -1,19 +1,29 @@
 """The lines that begin the READMEs of clients, typed as they stand, on a server that is there already."""
 
+import contextlib
 import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 
+from server.field.fields_by_level import FieldsByLevel
 from tests.clients.test_godot import QUIET, needs_godot
+from tests.clients.test_javascript import NPM, needs_packages
 from tests.clients.test_unity import needs_mono
 from tests.clients.test_unreal import needs_compiler
 from tests.clients.vectors import CLIENTS, readme_commands
+from tests.serving import serving
 
 
 def typed(client: str, served: str, folder: Path, *, last: str = "") -> str:
@@ -75,3 +85,59 @@ def test_python(served, tmp_path):
     heard, rate = soundfile.read(tmp_path / "heard.wav")
     assert len(heard) >= 1.9 * rate
     assert np.abs(heard).max(axis=0).min() > 1e-3
+
+
+@contextlib.contextmanager
+def running(command: str, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """What a shell is told to do, which it does not end by itself."""
+    environment = {**QUIET, "npm_config_offline": "true", "npm_config_audit": "false", "npm_config_fund": "false"}
+    with subprocess.Popen(["bash", "-ec", command], cwd=folder, env=environment, start_new_session=True) as shell:
+        try:
+            yield shell
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # it has ended after all
+                os.killpg(shell.pid, signal.SIGTERM)
+
+
+@pytest.mark.skipif(NPM is None, reason="no npm on the PATH (Debian: apt-get install npm)")
+@needs_packages
+def test_javascript(bundle, hrtfs, tmp_path):
+    """The packages that it needs are those that are there, since a test installs nothing from elsewhere."""
+    visitor = pytest.importorskip("tests.visitor")
+    if visitor.CHROMIUM is None:
+        pytest.skip("no chromium on the PATH (Debian: apt-get install chromium)")
+    # A copy, since npm writes into it, of what git has and of what npm had installed.
+    made = shutil.ignore_patterns("src", "LICENSE", "*.bundle.js")
+    copy = tmp_path / "client_examples" / "javascript"
+    shutil.copytree(CLIENTS / "javascript", copy, ignore=made, symlinks=True)
+    (tmp_path / "server").symlink_to(CLIENTS.parent / "server")
+    shutil.copy(CLIENTS.parent / "LICENSE", tmp_path)
+    serve, *rest = readme_commands("javascript")
+    [origin] = re.findall(r"^NAFIR_ALLOWED_ORIGINS=(\S+) nafir serve &$", serve)
+    [page_url] = re.findall(r"then open (\S+)$", rest[-1])
+    here = f"http://127.0.0.1:{visitor.free_port()}"
+    assert page_url.startswith(origin)
+    text = "\n".join(rest).replace(origin, here).replace("http.server 8080", f"http.server {here.rpartition(':')[2]}")
+    with (
+        serving(FieldsByLevel.load(bundle), hrtfs, allowed_origins=(here,)) as address,
+        running(text, tmp_path) as shell,
+    ):
+        url = page_url.replace(origin, here)
+        while shell.poll() is None:
+            with contextlib.suppress(urllib.error.URLError), urllib.request.urlopen(url, timeout=5):
+                break
+            time.sleep(0.1)
+        with visitor.sync_api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=visitor.CHROMIUM, args=visitor.CHROMIUM_ARGUMENTS)
+            page = browser.new_page()
+            page.set_default_timeout(visitor.WAIT_MS)
+            page.goto(f"{url}?server=http://{address}&scene=flat")
+            page.click("#start")
+            page.wait_for_function("window.example?.nafir.latency.direct")
+            page.wait_for_timeout(1_000)
+            loudest = page.evaluate("""async () => {
+              const { left, right } = await example.nafir.capture(1);
+              return [left, right].map((ear) => ear.reduce((most, sample) => Math.max(most, Math.abs(sample)), 0));
+            }""")
+            browser.close()
+    assert min(loudest) > 1e-3
