@@ -46,9 +46,9 @@ REPORT_S = 0.25
 """Seconds between two reports of a process."""
 _STALE_S = 5.0
 HUNG_S = 30.0
-"""Seconds without a report after which a process that has reported before is ended. Its event loop reports, and is
-never held up for more than a fraction of a second, also where the machine has too little for all. Clients have long
-given up by then, and resume elsewhere."""
+"""Seconds without a report after which a process that was ready is ended. Its event loop reports, and is then held up
+for a fraction of a second at most, or a few where the machine has too little for all. Clients have long given up by
+then, and resume elsewhere."""
 _PRESUMED_LOAD = 0.02
 """Share of a core that a connection is taken to need until the next report: connections that come together are spread
 over the processes."""
@@ -98,6 +98,7 @@ class Member:
     reported_s: float = -math.inf
     handed_s: float = -math.inf
     """When the last connection was handed to it."""
+    was_ready: bool = False
     silent_s: float = 0.0
     """How long it has not reported, while this process would have noticed."""
     unread: bytearray = field(default_factory=bytearray)
@@ -107,9 +108,10 @@ class Member:
         return self.silent_s > HUNG_S
 
     def wait(self, passed_s: float) -> None:
-        """Count time without a report, once there was one: a start may take minutes. Of a longer pause little counts,
-        since then this process was stopped too, as the whole machine may have been."""
-        if self.reported_s > -math.inf:
+        """Count time without a report, once it was ready: a start takes minutes, and compiling holds up its event loop
+        for seconds. Of a longer pause little counts, since then this process was stopped too, as the whole machine may
+        have been."""
+        if self.was_ready:
             self.silent_s += min(passed_s, _LONGEST_LOOK_S)
 
     def read(self, data: bytes, now_s: float) -> None:
@@ -120,6 +122,7 @@ class Member:
         if lines:
             report = json.loads(lines[-1])
             self.is_ready, self.load = report["is_ready"], report["load"]
+            self.was_ready = self.was_ready or self.is_ready
             self.handed, self.reported_s, self.silent_s = 0, now_s, 0.0
 
 

@@ -181,8 +181,8 @@ def test_reports_may_come_in_pieces_and_the_last_one_counts():
     assert (each.is_ready, each.load, each.handed, each.reported_s) == (True, 0.25, 0, 2.0)
 
 
-def report(each, now_s):
-    each.read(b'{"is_ready": true, "load": 0}\n', now_s)
+def report(each, now_s, *, ready=True):
+    each.read(json.dumps({"is_ready": ready, "load": 0}).encode() + b"\n", now_s)
 
 
 def test_a_process_hangs_once_it_has_not_reported_for_long():
@@ -199,12 +199,17 @@ def test_a_process_hangs_once_it_has_not_reported_for_long():
 
 def test_a_long_start_and_a_machine_that_was_stopped_are_no_hang():
     starting, working = (member(number, reported_s=-math.inf) for number in range(2))
+    report(starting, 0.0, ready=False)
     report(working, 0.0)
+    report(working, 0.0, ready=False)
     for _ in range(10):
         starting.wait(60.0)
         working.wait(600.0)
     assert not starting.is_hung
     assert not working.is_hung
+    for _ in range(40):
+        working.wait(600.0)
+    assert working.is_hung
 
 
 def test_connections_that_come_together_are_spread_and_later_ones_go_where_there_is_room(group):
