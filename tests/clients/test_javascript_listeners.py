@@ -397,6 +397,25 @@ def test_the_end_of_a_clip_is_told_and_one_that_is_removed_is_not_moved_any_more
     assert of(RemoveEmitter, moved) == [RemoveEmitter(id="horn")]
 
 
+def test_what_was_heard_to_its_end_since_the_snapshot_is_not_played_again(tmp_path):
+    *_, gone_on, again = run(
+        tmp_path,
+        OPENED,
+        [
+            ["receive", snapshot("sealed", 0)],
+            *[clip("shot", loop=False, removeWhenEnded=True), clip("loop")],
+            ["receive", ended("shot", True)],
+            *LOST,
+        ],
+        [["receive", resumed(handled=0)], ["level", "auto"], ["pause", SETTLED_MS]],
+        # The server counts what it got: two messages, of which it has handled one.
+        [*LOST, ["receive", resumed(handled=1)], ["pause", SETTLED_MS]],
+    )
+    assert [each.id for each in of(AddEmitter, gone_on)] == ["loop"]
+    assert of(AddEmitter, again) == []
+    assert of(SetLevel, again) == [SetLevel(level="auto")]
+
+
 def test_a_new_stream_goes_on_with_the_clock_and_begins_no_clip_again_that_plays_once(tmp_path):
     forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
     begun = [heard(name) for name in ("loop", "once", "stopped")]

@@ -318,6 +318,26 @@ def test_an_emitter_and_a_listener_that_a_snapshot_lacks_are_there_once_they_are
     assert (late.is_heard, late.start_clock, len(session.outbox)) == (True, 1_024, 3)
 
 
+def test_what_was_heard_to_its_end_since_the_snapshot_is_not_played_again():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.receive(snapshot("sealed", 0), 0.0)
+    for name in ("shot", "loop"):
+        session.add_emitter({"id": name, "clip": "noise", "position": (1.0, 2.0, 1.0)}, None)
+    drained(session.outbox)
+    session.receive('{"type": "emitter_ended", "id": "shot", "sample_clock": 9, "removed": true}', 0.0)
+    session.first_message()
+    session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=0), 0.0)
+    assert [json.loads(each)["id"] for each in drained(session.outbox)] == ["loop"]
+    # The server counts what it got: one message.
+    session.set_level("auto")
+    drained(session.outbox)
+    session.first_message()
+    session.greet(resumable(sample_clock=0, sequence=0, pose_id=0, handled=1), 0.0)
+    assert [json.loads(each)["type"] for each in drained(session.outbox)] == ["set_level"]
+
+
 def test_where_no_stream_is_kept_a_hello_begins_anew():
     session = Session("flat", {})
     session.first_message()

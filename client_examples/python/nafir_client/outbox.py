@@ -7,7 +7,7 @@ sent again.
 
 from collections import deque
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 Added = Literal["emitter", "listener"]
@@ -17,11 +17,13 @@ _MOST_KEPT: Final = 1_000
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message. `adds` is what it adds, if it does: the kind and the id of an emitter or listener."""
+    """A message. `adds` is what it adds, if it does: the kind and the id of an emitter or listener. Once that has ended
+    by itself, the message `is_over`, and is not sent again."""
 
     data: str | bytes
     is_counted: bool = False
     adds: tuple[Added, str] | None = None
+    is_over: bool = False
 
 
 class Outbox:
@@ -77,6 +79,13 @@ class Outbox:
         """Whether all counted messages but the first so many are still there."""
         return self._sent_count - handled <= len(self._sent)
 
+    def end(self, added: tuple[Added, str]) -> None:
+        """What the newest message with these `adds` has added has ended by itself."""
+        for index in reversed(range(len(self._sent))):
+            if self._sent[index].adds == added:
+                self._sent[index] = replace(self._sent[index], is_over=True)
+                return
+
     def forget(self, handled: int) -> None:
         """The first so many counted messages need not be sent again."""
         while self._sent and self._sent_count - len(self._sent) < handled:
@@ -88,4 +97,4 @@ class Outbox:
         lost = max(0, self._sent_count - handled)
         again = [self._sent.pop() for _ in range(lost)][::-1]
         self._sent_count -= lost
-        self.put_first(again)
+        self.put_first([message for message in again if not message.is_over])

@@ -583,6 +583,7 @@ class Session:
                 emitter.has_ended = True
                 if message.get("removed"):
                     del self.emitters[identifier]
+                    self.outbox.end(("emitter", identifier))
             case {"type": "listener_added", "id": identifier, "index": index, "sample_clock": clock} if (
                 identifier in self.listeners
             ):

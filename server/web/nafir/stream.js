@@ -68,7 +68,7 @@ export class Stream {
   #clockOffset = 0; // what is added to the server's clock, which begins at 0 with each new stream
   #nextClock = 0; // of the frame after the first listener's newest block, and when that came
   #clockAt = 0;
-  #orders = []; // the newest messages that the server counts: {text, key, adds, isSent}, and how many there were
+  #orders = []; // the newest messages that the server counts: {text, key, adds, isSent, isOver}, and how many there were
   #ordered = 0;
   #awaiting = new Map(); // key -> message that says what changed since the hello, for when the hello is answered
   #doors = null; // names of the scene's doors, once a welcome has said them
@@ -112,6 +112,7 @@ export class Stream {
     if (!this.#isOpen) return;
     if (!known || known.clip !== clip) {
       if (known) this.#order(message.removeEmitter(id));
+      this.#heard.delete(id);
       this.#dry.delete(id);
       this.#endWriter(id);
       this.#add(emitter);
@@ -218,7 +219,11 @@ export class Stream {
   }
 
   #ended({ id, removed }) {
-    if (removed) this.#dropEmitter(id);
+    if (removed) {
+      this.#dropEmitter(id);
+      const added = this.#orders.findLast(({ adds }) => adds === id);
+      if (added) added.isOver = true; // so that it is not played again
+    }
     this.#listeners.ended({ id, removed });
   }
 
@@ -556,7 +561,10 @@ export class Stream {
   /** Sends what the server had not got when the connection was lost, and where everything is now. */
   #goOn({ handled, listeners = [] }) {
     const missed = Math.max(0, this.#ordered - handled);
-    const lost = this.#orders.slice(this.#orders.length - missed);
+    const unhandled = this.#orders.splice(this.#orders.length - missed, missed);
+    const lost = unhandled.filter(({ isOver }) => !isOver);
+    this.#orders.push(...lost);
+    this.#ordered -= unhandled.length - lost.length;
     for (const order of lost) {
       this.#send(order.text);
       order.isSent = true;
