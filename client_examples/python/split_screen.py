@@ -10,16 +10,7 @@ import asyncio
 import sys
 
 import nafir_client
-from nafir_client.recording import Recording, write_wav
-
-
-async def record(listener: nafir_client.Stream | nafir_client.Listener, start_clock: int, frames: int) -> Recording:
-    recording = Recording(start_clock)
-    async for block in listener:
-        recording.add(block)
-        if recording.frames >= frames:
-            break
-    return recording
+from nafir_client.recording import record, write_wav
 
 
 async def play(url: str, scene: str, seconds: str) -> None:
@@ -28,7 +19,7 @@ async def play(url: str, scene: str, seconds: str) -> None:
         two = await one.add_listener((x - 0.5, y, z))
         clip = await one.add_emitter(clip="woman-reading")
         frames = round(float(seconds) * one.sample_rate)
-        heard = await asyncio.gather(*(record(each, clip.start_clock, frames) for each in (one, two)))
+        heard = await asyncio.gather(*(record(each, frames, start_clock=clip.start_clock) for each in (one, two)))
     for name, recording in zip(("one.wav", "two.wav"), heard, strict=True):
         write_wav(name, recording.samples(), one.sample_rate)
 

@@ -16,13 +16,12 @@ from nafir_client.errors import MissingExtraError
 from nafir_client.playback import Player
 from nafir_client.recording import PathAsHeard, Recording, write_wav
 from nafir_client.session import Message, StreamOptions
-from nafir_client.walk import Walk
+from nafir_client.walk import POSES_PER_S, Walk
 from nafir_client.wire import Block
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-POSES_PER_S = 30
 _SHOWN_PER_S = 10
 _QUIETEST_DB = -60.0
 _BAR = 30

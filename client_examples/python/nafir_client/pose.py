@@ -19,6 +19,12 @@ def yawed(yaw: float) -> Orientation:
     return (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
 
 
+def turned(yaw: float, pitch: float) -> Orientation:
+    """The orientation of a head that looks up by the `pitch` and is then turned by the `yaw`, both in radians."""
+    about_z, about_y = (math.sin(yaw / 2), math.cos(yaw / 2)), (-math.sin(pitch / 2), math.cos(pitch / 2))
+    return (-about_z[0] * about_y[0], about_z[1] * about_y[0], about_z[0] * about_y[1], about_z[1] * about_y[1])
+
+
 @dataclass(frozen=True)
 class Pose:
     """A position and an orientation, of numbers as a binary message holds them: single precision."""

@@ -1,13 +1,14 @@
 """Streams on disk: the sound as it arrived, and the path as it was heard."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import AsyncIterable, Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from nafir_client.errors import MissingExtraError
 from nafir_client.pose import Pose
+from nafir_client.scene import Scene
 from nafir_client.session import Message
 from nafir_client.wire import Block, Samples
 
@@ -56,6 +57,25 @@ class Recording:
             at = clock - self.start_clock
             samples[at : at + len(block)] = block[: max(0, frames - at)]
         return samples
+
+
+async def record(
+    listener: AsyncIterable[Block],
+    frames: int,
+    *,
+    start_clock: int = 0,
+    note_block: Callable[[Block], None] | None = None,
+) -> Recording:
+    """What a stream or a listener of it hears, of at least so many frames from a clock on. `note_block` gets each
+    block. Raises NafirClientError if the stream ends first."""
+    recording = Recording(start_clock)
+    async for block in listener:
+        recording.add(block)
+        if note_block is not None:
+            note_block(block)
+        if recording.frames >= frames:
+            break
+    return recording
 
 
 class PathAsHeard:
@@ -142,3 +162,13 @@ def level_sentence(change: Message, sample_rate: int) -> str:
         "recovered": "the server has recovered",
     }
     return f"{at_s:.2f} s: level {change['level']}, responses {pace}: {reasons.get(change['reason'], change['reason'])}"
+
+
+def render_command(scene: Scene, clip: str, path: Path, duration_s: float) -> str:
+    """The command that renders again what was heard along a path, of a clip in a loop where the scene suggests, with
+    every effect."""
+    x, y, z = scene.emitter.position
+    return (
+        f"nafir render {scene.id} --effects all --emitter {clip}@{x:g},{y:g},{z:g} --loop "
+        f"--path {path} --duration-s {duration_s:.6f} -o again.wav"
+    )

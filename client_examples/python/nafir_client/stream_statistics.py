@@ -70,6 +70,15 @@ class ListenerStatistics:
     """From a pose of the listener to its direct sound; of the first listener's also from those of emitters."""
     pose_to_reverberation: PoseWaits = field(default_factory=PoseWaits)
 
+    def sentences(self) -> list[str]:
+        """What is worth telling after a recording, a line each."""
+        kinds = {"direct sound": self.pose_to_sound.durations, "reverberation": self.pose_to_reverberation.durations}
+        waits = [
+            f"{kind}: {len(waits)} poses, received {waits.median_ms:.0f} ms after they were sent"
+            for kind, waits in kinds.items()
+        ]
+        return [*waits, f"{self.blocks_late} blocks late"]
+
     def summary(self) -> dict[str, float]:
         """Everything as numbers: counts, and medians in milliseconds; NaN where nothing was measured."""
         counts = "blocks", "blocks_late", "blocks_skipped", "blocks_dropped", "blocks_limited", "underruns"

@@ -1,11 +1,16 @@
 """A walk through a scene, for listening and for trying out."""
 
+import asyncio
 import math
 
 import numpy as np
 
 from nafir_client.pose import Pose, Position
+from nafir_client.recording import PathAsHeard
 from nafir_client.scene import Scene
+from nafir_client.stream import Stream
+
+POSES_PER_S = 30
 
 
 class Walk:
@@ -37,3 +42,15 @@ class Walk:
         heading = math.atan2(there[1] - here[1], there[0] - here[0])
         glance = math.radians(40) * math.sin(2 * math.pi * time_s / 4)
         return Pose.of(here + share * (there - here), yaw=heading + glance)
+
+    async def go(self, stream: Stream, path: PathAsHeard, time_s: float = 0.0) -> None:
+        """Put the first listener where the walk is after so many seconds. `path` notes the pose."""
+        pose = self.pose_at(time_s)
+        path.note_pose(await stream.move_listener(pose.position, orientation=pose.orientation), pose)
+
+    async def stroll(self, stream: Stream, path: PathAsHeard) -> None:
+        """Take the first listener along the walk, from now to its end."""
+        started_s = (loop := asyncio.get_running_loop()).time()
+        for step in range(1, round(self.duration_s * POSES_PER_S) + 1):
+            await asyncio.sleep(started_s + step / POSES_PER_S - loop.time())
+            await self.go(stream, path, step / POSES_PER_S)
