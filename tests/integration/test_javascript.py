@@ -191,6 +191,7 @@ def test_a_connection_that_is_made_again_has_its_listeners_where_they_are_by_the
         context.close()
 
 
+@pytest.mark.long
 def test_a_file_that_is_uploaded_is_played_once_from_a_clock_on_and_its_end_is_told(browser, bundle, hrtfs, tmp_path):
     soundfile.write(tmp_path / "tone.wav", 0.5 * np.sin(2 * np.pi * 1000 * np.arange(RATE) / RATE), RATE)
     given = list((tmp_path / "tone.wav").read_bytes())

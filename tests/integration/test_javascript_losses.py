@@ -100,10 +100,10 @@ def test_what_was_acknowledged_since_the_last_snapshot_is_said_again(browser, bu
         assert "listeners" not in told
         assert session(page) == first
         page.wait_for_function("second.latency.direct !== null")
-        page.wait_for_timeout(1_000)
+        page.wait_for_timeout(500)
         for whose in ("nafir", "second"):
             page.evaluate(f"window.nafir = {whose}")
-            heard = listen(page, 2.0)[0]
+            heard = listen(page)[0]
             spectrum = np.abs(np.fft.rfft(heard * np.hanning(len(heard))))
             assert np.argmax(spectrum) * RATE / len(heard) == pytest.approx(1000, abs=3)
             assert visitor.level_db(heard) > -60

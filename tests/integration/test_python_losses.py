@@ -167,6 +167,7 @@ def test_what_was_acknowledged_since_the_last_snapshot_is_said_again(bundle, hrt
     assert quieter_error_db(heard, expected, since) < -80
 
 
+@pytest.mark.long
 def test_a_stream_whose_snapshot_another_secret_signed_begins_anew(served, bundle, hrtfs, monkeypatch):
     Snapshots(monkeypatch)
 
