@@ -27,7 +27,6 @@ from training.simulation.responses import SimulatedResponses
 # In nepers, and in shares of the power: about what no field can predict from the places alone.
 _SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}
 _EXCHANGED_SHARE = 0.5
-_LEAST_AJAR = 0.01
 _HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
 
 
@@ -97,8 +96,7 @@ class DirectionalLearner(BasisLearner):
         openness = self._openness[pairs]
         paths = self.site.paths(listener, emitter, openness)
         if rng is not None:
-            blurred = rng.normal(openness, self.recipe.openness_noise).clip(_LEAST_AJAR, 1 - _LEAST_AJAR)
-            openness = np.where((openness > 0) & (openness < 1), blurred, openness).astype(np.float32)
+            openness = _blurred(openness, self.recipe.openness_noise, rng)
         told = (openness,) if openness.shape[1] else ()
         poses = (listener, emitter, paths, *told)
         knows_directions = torch.from_numpy((~exchanged).astype(np.float32))
@@ -130,3 +128,10 @@ def _exchanged(
     partners = [numbers.get((listener, emitter), number) for number, (emitter, listener) in enumerate(ends)]
     found = np.array([partner if number in used else number for number, partner in enumerate(partners)])
     return np.where((openness == openness[found]).all(axis=1), found, np.arange(len(found)))
+
+
+def _blurred(openness: npt.NDArray[np.float32], deviation: float, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+    """`openness` with noise where doors are ajar: of this standard deviation where they are half open, and in
+    proportion to how far they are from shut and from open."""
+    ajar = rng.normal(openness, 4 * deviation * openness * (1 - openness))
+    return np.where((openness > 0) & (openness < 1), ajar.clip(0, 1), openness).astype(np.float32)

@@ -65,7 +65,8 @@ class DirectionalRecipe:
     doors stand otherwise for the latter, the power is known one way only, and is learned as that of both, by turns.
     In levels whose doors move, a pair is known with the doors in one state only, and a network soon learns most of them
     by heart. There, `dropout` is the share of each hidden layer's features that a step leaves out, and `openness_noise`
-    the standard deviation of noise that is added to how far doors are ajar."""
+    the standard deviation of noise that is added to how far a door is open that stands half open. Others have less:
+    near shut, little changes much."""
 
     order: int = 2
     fine_frames: int = 24

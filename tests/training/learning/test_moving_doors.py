@@ -163,7 +163,8 @@ def test_a_power_that_is_known_one_way_is_learned_both_ways(dataset):
 
 
 def test_the_network_is_told_of_doors_ajar_with_noise(dataset):
-    """And of doors that are shut or open as they are; what it is told of paths is of where the doors are."""
+    """With less where they are nearly shut or open, and of those that are as they are; what it is told of paths is of
+    where the doors are."""
     responses = SimulatedResponses(dataset)
     learner = DirectionalLearner(responses, configure("directional", rank=16, width=32, epochs=1))
     learner.prepare(QUIET)
@@ -173,7 +174,7 @@ def test_the_network_is_told_of_doors_ajar_with_noise(dataset):
     ajar = (true > 0) & (true < 1)
     off = openness.numpy() - true
     assert not off[~ajar].any()
-    assert 0.04 < off[ajar].std() < 0.06
+    assert 0.04 < (off[ajar] / (4 * true[ajar] * (1 - true[ajar]))).std() < 0.06
     assert 0 < openness.numpy()[ajar].min() < openness.numpy()[ajar].max() < 1
     np.testing.assert_array_equal(path, learner.site.paths(listener.numpy(), emitter.numpy(), true))
     np.testing.assert_array_equal(learner.batch(rows, None)[0][3], true)
