@@ -337,12 +337,13 @@ if [[ " ${services[*]} " = *" prometheus "* ]]; then
 import json, time, urllib.request
 
 for _ in range(60):
-    (target,) = json.load(urllib.request.urlopen("http://prometheus:9090/api/v1/targets"))["data"]["activeTargets"]
-    if target["health"] == "up":
+    targets = json.load(urllib.request.urlopen("http://prometheus:9090/api/v1/targets"))["data"]["activeTargets"]
+    if [target["health"] for target in targets] == ["up"]:
         break
     time.sleep(1)
-assert target["health"] == "up", target["lastError"]
-print("Prometheus reads", target["scrapeUrl"])
+else:
+    raise SystemExit(f"Prometheus reads no metrics: {targets}")
+print("Prometheus reads", targets[0]["scrapeUrl"])
 '
 fi
 # From outside the networks of compose, through the port of Caddy, by a user who is not root.
