@@ -612,7 +612,9 @@ class Admission:
     def _announce(self, load: ServerLoad) -> int:
         """Have each thread render as many blocks at once as it will need for those who come, and for IRs to be in time;
         return as many as the latter takes."""
-        for_waits = blocks_for_waits(self._limits, self._thresholds, load)
+        now_s = self._time_s()
+        others_come = self._others_wait(now_s) or any(place.until_s > now_s for place in self._places)
+        for_waits = blocks_for_waits(self._limits, self._thresholds, load, others_come=others_come)
         for number, thread in enumerate(self._engine.threads):
             is_expecting = any(
                 place.until_s > self._time_s() and place.thread == number and place.kind is not None

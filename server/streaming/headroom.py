@@ -319,15 +319,18 @@ def blocks_needed(limits: Limits, thresholds: Thresholds, thread: ThreadLoad) ->
     return most
 
 
-def blocks_for_waits(limits: Limits, thresholds: Thresholds, load: ServerLoad) -> int:
+def blocks_for_waits(limits: Limits, thresholds: Thresholds, load: ServerLoad, *, others_come: bool) -> int:
     """Return at how many blocks at once the threads leave time enough for IRs; the most if they never do. Poses are
-    heard later before reverberation lags."""
+    heard later before reverberation lags. Unless `others_come`, streams on top of their ladders do not count: those who
+    are there for long are heard at once rather than often."""
     *fewer, most = thresholds.blocks_at_once
     return next(
         (
             blocks
             for blocks in fewer
-            if _waits_are_short(limits, thresholds, load, least=blocks, part=limits.for_newcomers)
+            if not (
+                others_come and not _waits_are_short(limits, thresholds, load, least=blocks, part=limits.for_newcomers)
+            )
             and _turns_are_soon(limits, thresholds, load, least=blocks, part=limits.for_newcomers)
         ),
         most,

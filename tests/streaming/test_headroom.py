@@ -98,9 +98,18 @@ def test_what_workers_do_not_get_is_taken_elsewhere():
 def test_poses_are_heard_later_before_reverberation_lags():
     cost = StreamCost(0.024, loop=0.0035, request_s=0.0024, rate_hz=12.0)
     load = replace(EMPTY, threads=(ThreadLoad(),), cores=1, most_streams=1_000)
-    blocks = [blocks_for_waits(LIMITS, THRESHOLDS, crowd(number, cost, load)) for number in range(41)]
-    assert blocks == sorted(blocks)
-    assert (blocks[5], blocks[40]) == (1, 8)
+    for others_come in (True, False):
+        crowds = [crowd(number, cost, load) for number in range(41)]
+        blocks = [blocks_for_waits(LIMITS, THRESHOLDS, each, others_come=others_come) for each in crowds]
+        assert blocks == sorted(blocks)
+        assert (blocks[5], blocks[40]) == (1, 8)
+
+
+def test_poses_are_heard_at_once_where_nobody_comes_and_streams_on_top_ask_for_much():
+    cost = StreamCost(0.024, loop=0.0035, request_s=0.0024, rate_hz=12.0, is_top=True, patience_s=THRESHOLDS.patience_s)
+    load = crowd(20, cost, replace(EMPTY, threads=(ThreadLoad(),), cores=1, most_streams=1_000))
+    assert blocks_for_waits(LIMITS, THRESHOLDS, load, others_come=True) > 1
+    assert blocks_for_waits(LIMITS, THRESHOLDS, load, others_come=False) == 1
 
 
 def test_a_stream_that_has_the_server_to_itself_always_fits():
