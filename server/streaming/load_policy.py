@@ -38,8 +38,8 @@ class LoadSample:
 
     `lateness` is the longest time from a block's due time until it was ready, as a share of what the client has in
     hand: 1 is late. `ir_wait_s` is the longest time from requesting IRs to having them, so far if the stream still
-    waits; None if it requested none. `request_s` and `plan_s` are smoothed CPU times of a request for IRs and of a plan
-    of effects.
+    waits; None if it requested none. `ir_interval_s` is the least time between its requests. `request_s` and `plan_s`
+    are smoothed CPU times of a request for IRs and of a plan of effects.
     """
 
     lateness: float = 0.0
@@ -48,6 +48,7 @@ class LoadSample:
     plan_s: float = 0.0
     rendering: float = 0.0
     is_in_effect: bool = True
+    ir_interval_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -300,16 +301,24 @@ def requests_at_once(thresholds: Thresholds, *, workers: int, threads: int) -> i
     return thresholds.requests_ahead + math.ceil(workers / threads)
 
 
-def patience_s(thresholds: Thresholds, step: QualityStep) -> float:
-    """Return how long IRs may take from their request to their arrival."""
+def patience_s(thresholds: Thresholds, step: QualityStep, interval_s: float = 0.0) -> float:
+    """Return how long IRs may take from their request to their arrival, where requests are at least `interval_s` apart:
+    the longer for that, but no longer than with the fewest requests there may be, as reverberation lags meanwhile."""
     if step.ir_rate_hz is None:
         return thresholds.patience_s
-    return max(thresholds.patience_s, thresholds.patience_intervals / step.ir_rate_hz)
+    paced_s = min(max(1 / step.ir_rate_hz, interval_s), 1 / thresholds.least_ir_rate_hz)
+    return max(thresholds.patience_s, thresholds.patience_intervals * paced_s)
+
+
+def _patience_s(thresholds: Thresholds, ladder: Ladder, sample: LoadSample) -> float:
+    """Return the patience of a stream. On the step on which it was let in, where it shares a budget with all who have
+    come since, it goes by how often it may ask now: others that come do not lower it."""
+    return patience_s(thresholds, ladder.step, sample.ir_interval_s if ladder.at == ladder.let_in_at else 0.0)
 
 
 def longest_wait(thresholds: Thresholds, state: LoadState[Key], measurement: Measurement[Key]) -> float:
-    """Return the longest wait for IRs as a share of the patience of the stream that waits. Streams whose step is not in
-    effect yet do not count."""
+    """Return the longest wait for IRs as a share of the patience on the step of the stream that waits. Streams whose
+    step is not in effect yet do not count."""
     return max(
         (
             (sample.ir_wait_s or 0.0) / patience_s(thresholds, state.ladders[key].step)
@@ -370,7 +379,7 @@ def _judge_stream(
     something `since_s`."""
     wait_s = _new_wait_s(thresholds, sample.ir_wait_s or 0.0, now_s - since_s)
     # IRs of another level are all computed anew: how long that takes says nothing of the waits that follow.
-    is_overloaded = sample.is_in_effect and wait_s > patience_s(thresholds, ladder.step)
+    is_overloaded = sample.is_in_effect and wait_s > _patience_s(thresholds, ladder, sample)
     expected_s = wait_s * ladder.above.cost_ms / ladder.step.cost_ms
     would_be_well = expected_s <= thresholds.patience_above * patience_s(thresholds, ladder.above)
     judged = replace(
@@ -446,14 +455,20 @@ def _slowest(
         and measurement.streams[key].is_in_effect
         and not ladder.is_lowest
     }
-    excess = max((_excess(thresholds, ladders[key], wait_s) for key, wait_s in waits_s.items()), default=0)
+    excess = max(
+        (
+            _excess(wait_s, _patience_s(thresholds, ladders[key], measurement.streams[key]))
+            for key, wait_s in waits_s.items()
+        ),
+        default=0,
+    )
     ranked = sorted(waits_s, key=lambda key: (ladders[key].at, -waits_s[key]))
     return ranked[: math.ceil(excess * len(ranked))]
 
 
-def _excess(thresholds: Thresholds, ladder: Ladder, wait_s: float) -> float:
+def _excess(wait_s: float, patience_s: float) -> float:
     """Return the share of a wait for IRs that is beyond a stream's patience."""
-    return max(0.0, 1 - patience_s(thresholds, ladder.step) / wait_s) if wait_s else 0.0
+    return max(0.0, 1 - patience_s / wait_s) if wait_s else 0.0
 
 
 def _best_off(

@@ -71,7 +71,7 @@ class Thresholds:
     patience_s: float = 0.15
     """Seconds that responses may take from being asked for: a reverberation that follows later is heard to lag."""
     patience_intervals: float = 1.5
-    """Intervals between requests that responses may take, on a step that asks less often."""
+    """Intervals between requests that responses may take, below the top of a ladder, where streams ask less often."""
     patience_above: float = 0.5
     """Share of the patience of the step above within which responses are expected there, before a stream steps up."""
 

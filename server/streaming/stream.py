@@ -181,6 +181,7 @@ class Stream:
         """When the first block since the start plays."""
         self._worst_lateness_s = 0.0
         self._worst_sent_s = 0.0
+        self._ir_interval_s = 0.0
         """The longest time from a block's due time until it was sent, since the last measurement; the sender writes
         it."""
         self._next_check_s: float | None = FIRST_S
@@ -389,6 +390,7 @@ class Stream:
             self._costs.plan_s,
             rendering=rendered.cost_s / rendered.duration_s if rendered.duration_s else self.load,
             is_in_effect=all(member.session.quality == self.ladder.step for member in self.audience.members),
+            ir_interval_s=self._ir_interval_s,
         )
 
     def note_sent(self, deadline_s: float, now_s: float) -> bool:
@@ -411,6 +413,7 @@ class Stream:
 
     def set_intervals(self, ir_s: float, plan_s: float) -> None:
         """Set the least time between requests for IRs, and between plans of effects."""
+        self._ir_interval_s = ir_s
         for member in self.audience.members:
             member.session.space_plans(plan_s)
             member.session.set_ir_interval(ir_s)

@@ -353,6 +353,21 @@ def test_a_step_that_asks_less_often_bears_longer_waits():
     top, often, seldom, *_ = ladder(1).steps
     assert patience_s(THRESHOLDS, top) == patience_s(THRESHOLDS, often) == 0.15
     assert patience_s(THRESHOLDS, seldom) == pytest.approx(0.3)
+    # Where a budget makes it ask less often still, but never longer than with the fewest requests there may be.
+    assert patience_s(THRESHOLDS, often, 0.3) == pytest.approx(0.45)
+    assert patience_s(THRESHOLDS, often, 0.01) == 0.15
+    assert patience_s(THRESHOLDS, often, 9.0) == pytest.approx(1.5 / THRESHOLDS.least_ir_rate_hz)
+    assert patience_s(THRESHOLDS, top, 9.0) == 0.15
+
+
+def test_a_stream_is_not_lowered_from_where_it_was_let_in_for_asking_less_often():
+    def steps(let_in_at, wait_s):
+        stream = dataclasses.replace(ladder(1, 2, 4, at=1), let_in_at=let_in_at)
+        return Host([stream], lambda _: LoadSample(ir_wait_s=wait_s, ir_interval_s=0.4)).run(2).steps
+
+    assert steps(let_in_at=1, wait_s=0.5) == []
+    assert steps(let_in_at=1, wait_s=0.7), "beyond its patience of one and a half intervals"
+    assert steps(let_in_at=0, wait_s=0.5), "it came down itself"
 
 
 class Core:
