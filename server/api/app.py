@@ -22,6 +22,7 @@ from server.api.bundle_store import BundleStore
 from server.api.catalogue import load_hrtfs, load_scenes, open_clips, playable_clips
 from server.api.compression import Compression
 from server.api.connection import MeasuredScene, StreamHost
+from server.api.connection_limits import HEALTH_PATHS, LIVENESS_PATH
 from server.api.cross_site import CrossSiteGate, SitePolicy
 from server.api.drain_gate import DrainGate
 from server.api.first_start import CompilingProcess, tell_while_compiling
@@ -206,14 +207,18 @@ def create_app(
     app.add_middleware(Compression)
     app.add_middleware(StrictRequests, routes=app.router.routes, closed=_turn_away)
     rate_limits = RateLimits.of(settings)
+    # Where readiness needs a key, keys could be guessed there.
+    open_paths = HEALTH_PATHS if access is None else (LIVENESS_PATH,)
     if access is not None:
-        app.add_middleware(RateGate, limits=rate_limits, actor=key_of)
+        app.add_middleware(RateGate, limits=rate_limits, actor=key_of, open_paths=open_paths)
         app.add_middleware(AccessGate, access=access, page=page_paths(WEB) if settings.page else frozenset())
-    app.add_middleware(RateGate, limits=rate_limits, actor=address_of)
+    app.add_middleware(RateGate, limits=rate_limits, actor=address_of, open_paths=open_paths)
     app.add_middleware(CrossSiteGate, policy=SitePolicy.of(settings))  # outside the others: gives refusals CORS headers
     app.add_middleware(RequestLog, routes=app.router.routes, refused=refused, durations=durations)
     if settings.page:
-        app.mount("/", PageFiles(directory=WEB, html=True, check_dir=False), name="web")
+        # With a key that the browser adds, a page of another site could lay this one under its own and have it clicked.
+        framed_by = None if access is None else settings.allowed_origins
+        app.mount("/", PageFiles(framed_by=framed_by, directory=WEB, html=True, check_dir=False), name="web")
     return app
 
 

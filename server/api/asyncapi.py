@@ -96,6 +96,7 @@ These are defaults; an operator may set other limits.
 
 **Keys.** Where the server asks for a key, the handshake carries it as `Authorization: Bearer KEY` or, from a browser,
 as one of the subprotocols: `nafir.key.` and the key in base64url, beside `nafir.v{PROTOCOL}`, which the server chooses.
+A key that the browser has asked its user for (`Authorization: Basic`, as the password) will do, too.
 Without one it is refused with 401 or 403 and a problem document. A stream ends when its key or token does
 (`key_expired`, `key_revoked`, close code {ACCESS_ENDED}).
 

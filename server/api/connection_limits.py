@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 from server.api.settings import Settings
 
-HEALTH_PATHS = "/livez", "/readyz"
+LIVENESS_PATH = "/livez"
+READINESS_PATH = "/readyz"
+HEALTH_PATHS = LIVENESS_PATH, READINESS_PATH
 """Paths for process supervisors. They are answered for any `Host`, and also when all other connections are taken."""
 
 UPLOAD_PATH = "/v1/clips"

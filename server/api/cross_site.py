@@ -9,20 +9,23 @@ keep such pages out, for HTTP requests and WebSocket upgrades alike:
 - **Origin.** A browser says from which site a page came (RFC 6454; Fetch, `Sec-Fetch-Site`). The server's own page and
   sites that the operator named are allowed. Programs other than browsers send no origin and are allowed.
 
+A browser adds a key that it was given by HTTP Basic to whatever it sends to this server, whichever page asks. So that
+key is taken out of requests of named sites, which have keys of their own. What a page of another site can ask without
+an origin, such as a picture, are files of the page, and it can change nothing.
+
 Each of these headers may occur only once. Otherwise a proxy and this server could each go by a different one. Health
 checks are answered in any case: they reveal nothing and cost nothing.
 """
 
-import ipaddress
 from dataclasses import dataclass
 from typing import Self
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.api.authority import Authority
 from server.api.connection_limits import HEALTH_PATHS
 from server.api.problems import Refusal, problem, refuse
 from server.api.settings import Settings
@@ -33,6 +36,7 @@ _EXPOSED = ("ETag", "Retry-After", "WWW-Authenticate", "X-Request-ID")
 _METHODS = ("GET", "HEAD", "POST", "DELETE")
 _HEADERS = ("Authorization", "Content-Type", "If-None-Match", "Range", "X-Request-ID")
 _DECISIVE = ("Host", "Origin", "Sec-Fetch-Site")
+_READ = frozenset({"GET", "HEAD", "OPTIONS"})
 _FOR_PROGRAMS = ("/v1/", "/metrics")
 """Paths for programs, to which no link of a page leads."""
 
@@ -55,13 +59,13 @@ class SitePolicy:
             is_loopback=settings.is_loopback,
         )
 
-    def refusal(self, path: str, headers: Headers, *, scheme: str = "http") -> Refusal | None:
+    def refusal(self, path: str, headers: Headers, *, scheme: str = "http", method: str = "GET") -> Refusal | None:
         """The refusal of a request; None if it is allowed. `scheme` is that of its URL: `http`, `https`, `ws` or
         `wss`."""
         for name in _DECISIVE:
             if (times := len(headers.getlist(name))) > 1:
                 return Refusal(400, "doubled_header", f"{name} is given {times} times: give it once")
-        host = _Authority.parsed(headers.get("host", ""))
+        host = Authority.parsed(headers.get("host", ""))
         if not self._may_be_called(host):
             return Refusal(
                 421, "host_not_allowed", f"this server does not answer to {host.name!r}: name it in NAFIR_ALLOWED_HOSTS"
@@ -69,7 +73,9 @@ class SitePolicy:
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
         if origin is None:
             # For instance a picture in another site's page. A visitor may still follow a link from there to our page.
+            # Fetch has browsers send an origin with every method that may change something; some old ones do not.
             is_foreign = path.startswith(_FOR_PROGRAMS) and site == "cross-site"
+            is_foreign |= method not in _READ and site in {"cross-site", "same-site"}
             origin = "another site" if is_foreign else None
         elif origin.lower() in self.origins or _is_own(origin, host, scheme=scheme, site=site):
             origin = None
@@ -79,13 +85,17 @@ class SitePolicy:
             403, "origin_not_allowed", f"pages of {origin} may not use this server: name it in NAFIR_ALLOWED_ORIGINS"
         )
 
-    def _may_be_called(self, host: "_Authority") -> bool:
-        if _ANY in self.hosts or host.name in self.hosts:
+    def is_of_another_site(self, headers: Headers, *, scheme: str = "http") -> bool:
+        """Whether a request that is allowed comes from a page other than the server's own, as far as browsers say."""
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site")
+        if origin is None or (scheme in {"http", "https"} and site == "same-origin"):
+            return False
+        return not _is_own(origin, Authority.parsed(headers.get("host", "")), scheme=scheme, site=site)
+
+    def _may_be_called(self, host: Authority) -> bool:
+        if _ANY in self.hosts or host.name in self.hosts or host.is_loopback:
             return True
-        if host.name == "localhost" or host.name.endswith(".localhost"):  # RFC 6761, 6.3: always loopback
-            return True
-        address = _address(host.name)
-        return address is not None and (address.is_loopback or not self.is_loopback)
+        return host.address is not None and not self.is_loopback
 
 
 class CrossSiteGate:
@@ -107,11 +117,14 @@ class CrossSiteGate:
         if scope["type"] not in {"http", "websocket"} or scope["path"] in HEALTH_PATHS:
             await self._app(scope, receive, send)
             return
-        refusal = self._policy.refusal(scope["path"], Headers(scope=scope), scheme=scope.get("scheme", "http"))
-        if refusal is None:
-            await self._app(scope, receive, _varying(send) if self._policy.origins else send)
-        else:
+        headers, scheme = Headers(scope=scope), scope.get("scheme", "http")
+        refusal = self._policy.refusal(scope["path"], headers, scheme=scheme, method=scope.get("method", "GET"))
+        if refusal is not None:
             await refuse(refusal, scope, receive, send)
+            return
+        if self._policy.is_of_another_site(headers, scheme=scheme):
+            scope = {**scope, "headers": [each for each in scope["headers"] if not _is_basic(*each)]}
+        await self._app(scope, receive, _varying(send) if self._policy.origins else send)
 
 
 class _Cors(CORSMiddleware):
@@ -130,23 +143,12 @@ class _Cors(CORSMiddleware):
         return refused
 
 
-@dataclass(frozen=True)
-class _Authority:
-    """A host name in lower case, without brackets, and its port if one is given."""
-
-    name: str
-    port: int | None
-
-    @classmethod
-    def parsed(cls, text: str) -> Self:
-        try:
-            parts = urlsplit(f"//{text}")
-            return cls((parts.hostname or "").rstrip("."), parts.port)
-        except ValueError:  # not a valid authority
-            return cls(text, None)
+def _is_basic(name: bytes, value: bytes) -> bool:
+    """Whether a header is one by which a browser sends a key of its own accord."""
+    return name.lower() == b"authorization" and value.partition(b" ")[0].lower() == b"basic"
 
 
-def _is_own(origin: str, host: _Authority, *, scheme: str, site: str | None) -> bool:
+def _is_own(origin: str, host: Authority, *, scheme: str, site: str | None) -> bool:
     """Whether a page has the same origin as its request, `scheme` included (RFC 6454, 4).
 
     A proxy in front may speak TLS without saying so. Then `scheme` is `http` for pages of either scheme, and `site`,
@@ -161,16 +163,9 @@ def _is_own(origin: str, host: _Authority, *, scheme: str, site: str | None) -> 
     usual = _USUAL_PORTS.get(page_scheme)
     if usual is None:
         return False
-    page = _Authority.parsed(rest)
+    page = Authority.parsed(rest)
     ports = (page.port or usual, host.port or usual)
     return bool(page.name) and page.name == host.name and ports[0] == ports[1]
-
-
-def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(name)
-    except ValueError:
-        return None
 
 
 def _varying(send: Send) -> Send:

@@ -7,7 +7,7 @@ from fastapi.openapi.utils import get_openapi
 
 from server.api.access_gate import scopes_for
 from server.api.api_keys import SCOPES
-from server.api.connection_limits import HEALTH_PATHS
+from server.api.connection_limits import HEALTH_PATHS, LIVENESS_PATH
 from server.api.openapi_examples import answer_examples, parameter_example
 from server.api.problem_codes import PROBLEM_CODES
 from server.responses.response_batch import ResponseBatch
@@ -79,6 +79,11 @@ _KEY: Final[Object] = {
     "scheme": "bearer",
     "description": "An API key, or a JSON Web Token with the scope in `scope`.",
 }
+_PASSWORD: Final[Object] = {
+    "type": "http",
+    "scheme": "basic",
+    "description": "The same as a password, with any name: so browsers send it by themselves.",
+}
 
 
 def install_openapi(app: FastAPI, *, max_poses: int, is_protected: bool = False) -> None:
@@ -105,12 +110,14 @@ def describe(app: FastAPI, *, max_poses: int, is_protected: bool = False) -> Obj
     schemas |= batch.pop("$defs")
     schemas[ResponseBatch.__name__] = batch
     if is_protected:
-        document["components"]["securitySchemes"] = {"key": _KEY}
+        document["components"]["securitySchemes"] = {"key": _KEY, "password": _PASSWORD}
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
-            if is_protected and path not in HEALTH_PATHS:
+            if is_protected and path != LIVENESS_PATH:
                 needed = scopes_for(method.upper(), path)
-                operation["security"] = [{"key": [scope]} for scope in SCOPES if scope in needed]
+                operation["security"] = [
+                    {scheme: [scope]} for scope in SCOPES if scope in needed for scheme in ("key", "password")
+                ]
             for parameter in operation.get("parameters", ()):
                 parameter["schema"] = _without_null(parameter["schema"])
                 example = parameter_example(parameter["name"], parameter["schema"])

@@ -5,6 +5,7 @@ import gzip
 import hashlib
 import mimetypes
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,12 @@ _COMPRESSED = ".gz"
 
 class PageFiles(StaticFiles):
     """Static files with entity tags by content. Starlette's tags depend on size and modification time, which two builds
-    of one image may share although the bytes differ. Starlette also sends no `Allow`, and knows no compressed files."""
+    of one image may share although the bytes differ. Starlette also sends no `Allow`, and knows no compressed files.
+    `framed_by` are the only other origins whose pages may show the files in a frame; with None any may."""
+
+    def __init__(self, *, framed_by: Sequence[str] | None = None, **options: Any) -> None:
+        super().__init__(**options)
+        self._policy = None if framed_by is None else " ".join(("frame-ancestors 'self'", *framed_by))
 
     def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
         for suffix in ("", ".html", _COMPRESSED):
@@ -60,6 +66,8 @@ class PageFiles(StaticFiles):
             response.headers["Vary"] = "Accept-Encoding"
             tag = f'{tag[:-1]}-whole"'
         response.headers["ETag"] = tag
+        if self._policy is not None:
+            response.headers["Content-Security-Policy"] = self._policy
         had = Headers(scope=scope).get("if-none-match", "")
         if response.headers["ETag"] in {tag.strip().removeprefix("W/") for tag in had.split(",")}:
             return NotModifiedResponse(response.headers)

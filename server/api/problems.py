@@ -38,7 +38,8 @@ async def refuse(refusal: Refusal, scope: Scope, receive: Receive, send: Send) -
         await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": refusal.code})
         return
     response = problem(refusal.status, refusal.code, refusal.detail)
-    response.headers.update(dict(refusal.headers))
+    for name, value in refusal.headers:  # a name may come twice
+        response.headers.append(name, value)
     await response(scope, receive, send)
 
 

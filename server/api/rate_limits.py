@@ -8,18 +8,17 @@ Addresses of this machine have no bucket: behind them is its owner, or a proxy w
 of one process. The module does no I/O.
 """
 
-import ipaddress
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final, Literal, Self
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.access_gate import caller_of, scopes_for
-from server.api.connection_limits import HEALTH_PATHS
+from server.api.client_address import client_address
 from server.api.problems import Refusal, refuse
 from server.api.seats import address_key
 from server.api.settings import Settings
@@ -112,14 +111,8 @@ class RateLimits:
 
 def address_of(scope: Scope) -> str | None:
     """The actor by its address; None for this machine, and for what is no address."""
-    client = scope.get("client")
-    host = client[0] if client else ""
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return None
-    mapped = getattr(address, "ipv4_mapped", None) or address
-    return None if mapped.is_loopback else f"address {address_key(host)}"
+    address = client_address(scope)
+    return None if address is None or address.is_loopback else f"address {address_key(str(address))}"
 
 
 def key_of(scope: Scope) -> str | None:
@@ -129,19 +122,23 @@ def key_of(scope: Scope) -> str | None:
 
 
 class RateGate:
-    """ASGI middleware that refuses with 429 what comes too fast from an `actor`."""
+    """ASGI middleware that refuses with 429 what comes too fast from an `actor`. `open_paths` are not
+    counted."""
 
-    def __init__(self, app: ASGIApp, *, limits: RateLimits, actor: Callable[[Scope], str | None]) -> None:
+    def __init__(
+        self, app: ASGIApp, *, limits: RateLimits, actor: Callable[[Scope], str | None], open_paths: Collection[str]
+    ) -> None:
         self._app = app
         self._limits = limits
         self._actor = actor
+        self._open = frozenset(open_paths)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
         path, actor = scope["path"].removeprefix(scope.get("root_path", "")), self._actor(scope)
-        if actor is None or path in HEALTH_PATHS:
+        if actor is None or path in self._open:
             await self._app(scope, receive, send)
             return
         kind: Kind = "stream" if scope["type"] == "websocket" else "request"

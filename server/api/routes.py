@@ -152,10 +152,12 @@ async def livez() -> dict[str, str]:
 @health.get("/readyz")
 async def readyz(request: Request) -> dict[str, str]:
     """Answers 200 if streams may be opened: the server is warmed up, its threads work, and it is not shutting down.
-    Where keys are needed, only who has one with the scope `admin` is told what is wrong."""
+    Where keys are needed, any key will do, programs on the server's own machine need none, and only who has one with
+    the scope `admin` is told what is wrong."""
     host = _host(request)
     if (obstacle := host.readiness.obstacle) is not None:
-        is_told = host.access is None or caller_of(request.scope) is not None
+        caller = caller_of(request.scope)
+        is_told = host.access is None or (caller is not None and "admin" in caller.scopes)
         message = obstacle.message if is_told else "the server is not ready"
         raise RequestError(obstacle.code, message, status=503, retry_after_s=obstacle.retry_after_s)
     return {"status": "ready"}

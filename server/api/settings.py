@@ -99,7 +99,7 @@ class Settings(BaseSettings):
     require_auth: bool = False
     """Whether the server refuses to start without keys. Without it, one that others can reach warns."""
     page: bool = True
-    """Whether the server has a page. Its files need no key."""
+    """Whether the server has a page, and `/docs` and `/redoc`. With keys, any of them opens their files."""
     log_format: Literal["console", "json"] = "console"
     """How `nafir serve` writes its log to standard error: lines for people, or JSON for programs."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"

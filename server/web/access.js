@@ -1,10 +1,12 @@
-// The key that the server may ask for. It is kept for this tab alone (sessionStorage) and leaves it in headers only. All pages
-// ask by the same dialog, which is made when the first needs it.
+// The key that the server may ask for. The browser asks its user for it and sends it by itself (HTTP Basic), which no page sees. Where
+// that is not enough, pages ask for one by the same dialog, which is made when the first needs it. That key is kept for its tab alone
+// (sessionStorage), leaves it in headers only, and comes before the browser's.
 
 import { fetchJson } from "./nafir/http.js";
 
 const KEPT_AS = "nafir.key";
 const NEEDS_KEY = 401;
+const NEEDS_ANOTHER = "scope_missing";
 const DIALOG = `
   <form id="key-form">
     <h2 id="key-title">This server asks for a key</h2>
@@ -19,15 +21,16 @@ let asking = null; // the promise of an answer, while the dialog is open
 
 export const key = () => sessionStorage.getItem(KEPT_AS);
 
-/** What the server says at `url`, asked with the key; with another if it refuses this one. */
-export async function getJson(url, options) {
+/** What the server says at `url`, asked with the key; with another if it refuses this one, and, if the page can do nothing without what is
+    `needed`, if this one is for something else. */
+export async function getJson(url, { needed = false, ...options } = {}) {
   const given = key();
   try {
     return await fetchJson(url, { ...options, key: given });
   } catch (error) {
-    if (error.status !== NEEDS_KEY) throw error;
+    if (error.status !== NEEDS_KEY && !(needed && error.code === NEEDS_ANOTHER)) throw error;
     await askForKey(error.message, given);
-    return getJson(url, options);
+    return getJson(url, { needed, ...options });
   }
 }
 

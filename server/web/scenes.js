@@ -7,7 +7,7 @@ import { decoderUrl } from "./nafir/http.js";
 const BASE = new URL("v1/", document.baseURI);
 const endpoint = (path) => new URL(path, BASE);
 
-export const fetchScenes = () => getJson(endpoint("scenes"));
+export const fetchScenes = () => getJson(endpoint("scenes"), { needed: true });
 export const fetchScene = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}`));
 export const fetchFrontier = (id) => getJson(endpoint(`scenes/${encodeURIComponent(id)}/frontier`));
 export const fetchClips = async () => (await getJson(endpoint("clips"))).clips;

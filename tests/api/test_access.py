@@ -8,6 +8,7 @@ import os
 import time
 
 import pytest
+import uvicorn
 from fastapi.routing import iter_route_contexts
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
@@ -18,6 +19,7 @@ from server.api.api_keys import SCOPES, create_key, revoke_key
 from server.api.app import WEB, create_app
 from server.api.connection import SUBPROTOCOL
 from server.api.process_peers import OWN_METRICS, OWN_STREAMS, PEER_KEY, ProcessPeers
+from server.api.serving import uvicorn_options
 from server.api.settings import Settings, settings_of
 from server.core.errors import NafirError
 from server.field.fields_by_level import FieldsByLevel
@@ -67,9 +69,23 @@ def client(bundle, hrtfs, folder, keys):
     peers = ProcessPeers(0, (1,), PEERS_KEY)
     app = create_app(settings, scenes=scenes, hrtfs=hrtfs, peers=peers)
     with TestClient(app, base_url="http://localhost:8000") as client:
-        while client.get("/readyz").status_code != 200:
+        until = time.monotonic() + 180
+        while client.get("/readyz", headers=bearer(keys["metrics"])).status_code != 200:
+            assert time.monotonic() < until
             time.sleep(0.05)
         yield client
+
+
+def from_address(client, host):
+    """Another client of the same running application, from an address."""
+    other = TestClient(client.app, base_url="http://localhost:8000", client=(host, 50_000))
+    other.app_state.update(client.app_state)
+    return other
+
+
+def basic(password, *, name="whoever"):
+    given = f"{name}:{password}".encode()
+    return {"Authorization": f"Basic {base64.b64encode(given).decode()}"}
 
 
 def paths(app):
@@ -89,43 +105,219 @@ def check_refused(answer, status, code):
     assert answer.headers["WWW-Authenticate"].startswith('Bearer realm="nafir"')
 
 
-def test_an_outsider_gets_nothing_but_health_and_the_page(client):
+OUTSIDER = "203.0.113.7"
+WRONG = (
+    {},
+    bearer("nafir_000000000000_wrong"),
+    bearer(token(exp=1)),
+    basic("nafir_000000000000_wrong"),
+    basic(token(exp=1)),
+    {"Authorization": "Basic eDp5"},
+    {"Authorization": "Digest username=x"},
+)
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+
+
+def page_files():
+    """The path of every file of the page, and of pages without `.html`."""
+    files = [file.relative_to(WEB).as_posix() for file in WEB.rglob("*") if file.is_file()]
+    pages = [name.removesuffix(".html") for name in files if name.endswith(".html")]
+    return ["/", *(f"/{name.removesuffix('.gz')}" for name in (*files, *pages))]
+
+
+def test_an_outsider_gets_nothing_but_the_liveness(client, keys):
     """Every route is tried, with every method: one that is added later is closed unless somebody opens it."""
-    tried = set()
-    for path, methods in paths(client.app):
-        for method in methods | {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}:
-            if path in {"/livez", "/readyz", "/"} or path == "":
-                continue
-            for given in (
-                {},
-                bearer("nafir_000000000000_wrong"),
-                bearer(token(exp=1)),
-                {"Authorization": "Basic eDp5"},
-            ):
-                answer = client.request(method, path, headers=given)
-                assert answer.status_code == 401, (method, path)
+    outsider = from_address(client, OUTSIDER)
+    document = client.get("/openapi.json", headers=bearer(keys["listen"])).json()
+    declared = {path: methods for path, methods in paths(client.app) if path}
+    described = {path.replace("{scene}", "flat"): frozenset() for path in document["paths"]}
+    unknown = ("/v2", "/nothing", "/livez/", "/livez/x", "/livez%00", "/%6divez", "/metrics%20", "/V1/scenes")
+    near_files = ("/docs/", "/docs.js.map", "/redoc/", "/index.html/", "/nafir", "/nafir/", "//", "/./main.js")
+    tried = {**described, **dict.fromkeys((*page_files(), *unknown, *near_files), frozenset()), **declared}
+    del tried["/livez"]
+    assert {"/v1/stream", "/v1/scenes", "/metrics", OWN_METRICS, "/openapi.json", "/asyncapi.json"} <= tried.keys()
+    assert {"/readyz", "/", "/docs", "/redoc", "/main.js", "/vendor/redoc.standalone.js"} <= tried.keys()
+    assert len(tried) > 80
+    for path, methods in tried.items():
+        for method in METHODS | methods:
+            for given in WRONG if path in declared else ({}, basic("nafir_000000000000_wrong")):
+                answer = outsider.request(method, path, headers=given, follow_redirects=False)
+                assert answer.status_code == 401, (method, path, given)
                 assert method == "HEAD" or answer.json()["code"] in {"key_required", "key_refused"}
-            tried.add(path)
-    assert {"/v1/stream", "/v1/scenes", "/metrics", OWN_METRICS, "/openapi.json", "/asyncapi.json"} <= tried
-    for path in (
-        "/docs/",
-        "/docs.js.map",
-        "/v2",
-        "/nothing",
-        "/livez/",
-        "/livez/x",
-        "/livez%00",
-        "/%6divez",
-        "/metrics%20",
-        "/V1/scenes",
+                assert answer.headers.keys() <= {
+                    "content-length", "content-type", "www-authenticate", "x-request-id", "vary", "content-encoding",
+                }  # fmt: skip
+    assert outsider.get("/livez").json() == {"status": "live"}
+    assert outsider.get("/livez", headers=WRONG[1]).json() == {"status": "live"}
+    assert outsider.post("/livez").status_code == 405
+
+
+@pytest.mark.parametrize("path", ["/v1/stream", "/v1/stream/", "/livez", "/readyz", "/", "/metrics", "/nothing"])
+def test_an_outsider_opens_no_web_socket(client, path):
+    for address in (OUTSIDER, "127.0.0.1"):
+        asking = from_address(client, address)
+        for given in WRONG:
+            with pytest.raises(WebSocketDenialResponse) as refused, asking.websocket_connect(path, headers={**given}):
+                pass
+            check_refused(refused.value, 401, "key_refused" if given else "key_required")
+
+
+def test_any_key_tells_whether_the_server_is_ready(client, keys):
+    outsider = from_address(client, OUTSIDER)
+    for key in (*keys.values(), token()):
+        assert outsider.get("/readyz", headers=bearer(key)).json() == {"status": "ready"}
+        assert outsider.head("/readyz", headers=basic(key)).status_code == 200
+    check_refused(outsider.get("/readyz", headers=bearer(token(scope=""))), 403, "scope_missing")
+    check_refused(outsider.post("/readyz", headers=bearer(keys["listen"])), 403, "scope_missing")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "::ffff:127.0.0.1"])
+def test_this_machine_needs_no_key_to_ask_whether_the_server_is_ready(client, host):
+    here = from_address(client, host)
+    for given in ({}, {"Host": "127.0.0.1:8000"}, {"Host": "[::1]:8000"}, *WRONG):
+        assert here.get("/readyz", headers=given).json() == {"status": "ready"}
+    check_refused(here.get("/v1/scenes"), 401, "key_required")
+    check_refused(here.get("/metrics"), 401, "key_required")
+
+
+@pytest.mark.parametrize(
+    "passed_on",
+    [
+        {"X-Forwarded-For": OUTSIDER},
+        {"X-Forwarded-For": "127.0.0.1"},  # as an outsider wrote it, and a proxy left it
+        {"Forwarded": f"for={OUTSIDER}"},
+        {"Via": "1.1 proxy"},
+        {"X-Real-IP": OUTSIDER},
+        {"Host": "sound.example"},
+        {"Host": "192.0.2.1"},
+    ],
+)
+def test_what_a_proxy_of_this_machine_passes_on_is_not_of_this_machine(client, passed_on):
+    here = from_address(client, "127.0.0.1")
+    check_refused(here.get("/readyz", headers=passed_on), 401, "key_required")
+
+
+def test_behind_a_proxy_of_this_machine_readiness_is_told_to_keys_alone(client, keys, monkeypatch):
+    """As `nafir serve` runs the application: it trusts proxies on loopback."""
+    monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
+    config = uvicorn.Config(client.app, **uvicorn_options(Settings()))
+    config.load()
+    proxied = TestClient(config.loaded_app, base_url="http://localhost:8000", client=("127.0.0.1", 50_000))
+    proxied.app_state.update(client.app_state)
+    assert proxied.get("/readyz").status_code == 200
+    for forwarded in (OUTSIDER, f"127.0.0.1, {OUTSIDER}", f"{OUTSIDER}, 127.0.0.1", "127.0.0.1", ""):
+        passed_on = {"X-Forwarded-For": forwarded}
+        check_refused(proxied.get("/readyz", headers=passed_on), 401, "key_required")
+        assert proxied.get("/readyz", headers={**passed_on, **bearer(keys["listen"])}).status_code == 200
+
+
+def challenges(answer):
+    return answer.headers.get_list("www-authenticate")
+
+
+def test_a_browser_is_told_to_ask_for_a_key_by_files_of_the_page_alone(client, keys):
+    for path in ("/", "/docs", "/redoc", "/main.js", "/nafir/stream_worker.js", "/fonts/instrument-sans.woff2"):
+        for given in WRONG:
+            first, second = challenges(client.get(path, headers=given))
+            assert first == 'Basic realm="nafir", charset="UTF-8"'
+            assert second.startswith('Bearer realm="nafir"')
+    for path in ("/v1/scenes", "/openapi.json", "/asyncapi.json", "/metrics", "/readyz", "/v1/stream", "/nothing"):
+        for given in (*WRONG, basic(keys["render"])):
+            answer = client.get(path, headers=given)
+            if answer.status_code in {401, 403}:
+                (only,) = challenges(answer)
+                assert only.startswith('Bearer realm="nafir"')
+    assert "password" in client.get("/").json()["detail"]
+
+
+def test_any_key_opens_every_file_of_the_page(client, keys):
+    for path in page_files():
+        assert client.get(path, headers=basic(keys["metrics"])).status_code == 200, path
+    for key in (*keys.values(), token()):
+        for given in (basic(key), bearer(key), basic(key, name=""), basic(key, name="Jürgen")):
+            assert client.get("/", headers=given).status_code == 200
+            assert client.head("/docs", headers=given).status_code == 200
+    check_refused_page = client.get("/", headers=bearer(token(scope="")))
+    check_refused(check_refused_page, 403, "scope_missing")
+
+
+def test_a_key_by_basic_does_what_a_bearer_does(client, keys):
+    for path, method in (("/v1/scenes", "GET"), (IR, "GET"), ("/v1/clips", "POST"), ("/metrics", "GET")):
+        for key in (*keys.values(), token()):
+            answers = [client.request(method, path, headers=given(key)) for given in (basic, bearer)]
+            codes = [(each.status_code, each.json()["code"] if each.is_error else None) for each in answers]
+            assert codes[0] == codes[1]
+    welcome, _ = opened(client, headers=basic(keys["listen"]))
+    assert isinstance(welcome, Welcome)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "",
+        "!",
+        "eA",  # not padded
+        "eA==",  # without a colon
+        "Og==",  # nothing on both sides of it
+        base64.b64encode(b"x:\xff\xfe").decode(),
+        base64.b64encode("x:schlüssel".encode()).decode(),
+        base64.b64encode(b"x:schl\xfcssel").decode(),
+        base64.b64encode(b"x:" + b"k" * 5_000).decode(),
+        base64.b64encode(b"x" * 5_000 + b":").decode(),
+        base64.b64encode(b"x:nafir_" + b"_" * 5_000).decode(),
+        base64.b64encode(b"x:" + b"." * 5_000).decode(),
+        "\u00fc",
+    ],
+)
+def test_what_is_no_key_by_basic_opens_nothing(client, given):
+    header = {"Authorization": f"Basic {given}".encode("latin-1")}
+    for path in ("/", "/v1/scenes", "/readyz"):
+        check = client.get(path, headers=header)
+        assert (check.status_code, check.json()["code"]) == (401, "key_refused")
+    with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect("/v1/stream", headers=header):
+        pass
+    assert refused.value.status_code == 401
+
+
+def test_a_key_of_the_page_comes_before_one_that_the_browser_adds(client, keys):
+    """Browsers add what they were given by Basic to the handshake of a stream, whatever the page says."""
+    for by_itself in (keys["render"], "wrong"):
+        welcome, _ = opened(client, headers=basic(by_itself), subprotocols=protocols(keys["listen"]))
+        assert isinstance(welcome, Welcome)
+    with (
+        pytest.raises(WebSocketDenialResponse) as refused,
+        client.websocket_connect("/v1/stream", headers=basic(keys["listen"]), subprotocols=protocols("wrong")),
     ):
-        assert client.get(path, follow_redirects=False).status_code == 401, path
-    assert client.get("/livez").status_code == client.get("/readyz").status_code == 200
-    for file in WEB.rglob("*"):
-        if file.is_file():
-            assert client.get(f"/{file.relative_to(WEB).as_posix().removesuffix('.gz')}").status_code == 200
+        pass
+    check_refused(refused.value, 401, "key_refused")
+
+
+def test_a_named_site_cannot_use_the_key_that_a_browser_adds(client, keys):
+    site = {"Origin": "https://game.example"}
+    for method, path in (("GET", "/v1/scenes"), ("POST", "/v1/clips"), ("DELETE", "/v1/clips/abc")):
+        check_refused(client.request(method, path, headers={**site, **basic(keys["upload"])}), 401, "key_required")
+        assert client.request(method, path, headers={**site, **bearer(keys["upload"])}).status_code != 401
+        own = {"Origin": "http://localhost:8000", "Sec-Fetch-Site": "same-origin"}
+        assert client.request(method, path, headers={**own, **basic(keys["upload"])}).status_code != 401
+    with (
+        pytest.raises(WebSocketDenialResponse) as refused,
+        client.websocket_connect("/v1/stream", headers={**site, **basic(keys["listen"])}),
+    ):
+        pass
+    check_refused(refused.value, 401, "key_required")
+
+
+def test_only_named_sites_may_show_the_page_in_a_frame(client, keys):
+    """A page of another site could lay it, opened by the key that the browser adds, under its own."""
     for path in ("/", "/docs", "/redoc"):
-        assert client.get(path).status_code == 200
+        policy = client.get(path, headers=basic(keys["listen"])).headers["Content-Security-Policy"]
+        assert policy == "frame-ancestors 'self' https://game.example"
+
+
+def test_caches_that_others_share_keep_nothing_that_a_key_has_opened(client, keys):
+    for path in (IR, "/v1/schemas/bundle", "/v1/scenes/flat/bundle/scene.json"):
+        answer = client.get(path, headers=bearer(keys["render"]))
+        assert answer.headers["Cache-Control"] == "private, max-age=3600"
 
 
 def test_no_route_of_version_1_is_closed_to_all_but_operators_by_oversight(client):
@@ -362,13 +554,16 @@ def test_the_code_of_every_end_of_access_is_described():
 
 def test_the_document_says_what_needs_a_key(client, keys):
     document = client.get("/openapi.json", headers=bearer(keys["listen"])).json()
-    assert document["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+    schemes = document["components"]["securitySchemes"]
+    assert {name: scheme["scheme"] for name, scheme in schemes.items()} == {"key": "bearer", "password": "basic"}
     for path, operations in document["paths"].items():
         for operation in operations.values():
-            assert ("security" in operation) == (path not in {"/livez", "/readyz"})
+            assert ("security" in operation) == (path != "/livez")
+            assert ("401" in operation["responses"]) == (path != "/livez")
     response = document["paths"]["/v1/scenes/{scene}/impulse-response"]["get"]
-    assert response["security"] == [{"key": ["render"]}]
-    assert "401" in response["responses"]
+    assert response["security"] == [{"key": ["render"]}, {"password": ["render"]}]
+    ready = document["paths"]["/readyz"]["get"]
+    assert ready["security"] == [{name: [scope]} for scope in SCOPES for name in ("key", "password")]
 
 
 def test_the_processes_of_a_server_ask_each_other_with_a_key_of_their_own(client, keys):
@@ -392,15 +587,20 @@ def test_the_processes_of_a_server_do_not_wait_for_each_other(client):
 
 
 def test_only_an_operator_is_told_why_a_server_is_not_ready(client, keys):
-    drain = client.app_state["host"].readiness
-    before, drain.warm_up = drain.warm_up, "failed"
+    readiness = client.app_state["host"].readiness
+    here = from_address(client, "127.0.0.1")
+    before, readiness.warm_up = readiness.warm_up, "failed"
     try:
-        told, outsider = (client.get("/readyz", headers=given).json() for given in (bearer(keys["admin"]), {}))
+        told = client.get("/readyz", headers=bearer(keys["admin"]))
+        others = (client.get("/readyz", headers=bearer(keys["listen"])), here.get("/readyz"))
+        outsider = client.get("/readyz")
     finally:
-        drain.warm_up = before
-    assert told["code"] == outsider["code"] == "not_ready"
-    assert outsider["detail"] == "the server is not ready"
-    assert told["detail"] != outsider["detail"]
+        readiness.warm_up = before
+    for answer in (told, *others):
+        assert (answer.status_code, answer.json()["code"]) == (503, "not_ready")
+    assert {answer.json()["detail"] for answer in others} == {"the server is not ready"}
+    assert told.json()["detail"] != "the server is not ready"
+    check_refused(outsider, 401, "key_required")
 
 
 # Files that change.

@@ -15,9 +15,9 @@ LOOPBACK = Settings(allowed_hosts=(), host="127.0.0.1")
 EVERYWHERE = Settings(allowed_hosts=(), host="0.0.0.0")
 
 
-def status(settings, path="/v1/scenes", *, scheme="http", **headers):
+def status(settings, path="/v1/scenes", *, scheme="http", method="GET", **headers):
     given = Headers({name.replace("_", "-"): value for name, value in headers.items()})
-    refusal = SitePolicy.of(settings).refusal(path, given, scheme=scheme)
+    refusal = SitePolicy.of(settings).refusal(path, given, scheme=scheme, method=method)
     return 200 if refusal is None else refusal.status
 
 
@@ -111,6 +111,15 @@ def test_pictures_in_pages_of_other_sites_cost_nothing_and_links_lead_to_the_pag
     assert status(LOOPBACK, "/metrics", host="localhost") == 200
     assert status(LOOPBACK, "/", **foreign) == 200
     assert status(LOOPBACK, "/v1/scenes", host="localhost", sec_fetch_site="same-origin") == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "DELETE", "PUT", "PATCH"])
+def test_a_page_of_another_site_changes_nothing_also_where_its_browser_hides_the_origin(method):
+    """A browser adds the key that it was given by HTTP Basic whichever page asks."""
+    for path in ("/", "/v1/clips", "/anything/new"):
+        for site, expected in (("cross-site", 403), ("same-site", 403), ("same-origin", 200), ("none", 200)):
+            assert status(LOOPBACK, path, method=method, host="localhost", sec_fetch_site=site) == expected
+        assert status(LOOPBACK, path, method=method, host="localhost") == 200
 
 
 @pytest.fixture

@@ -1,3 +1,4 @@
+import base64
 import math
 
 import pytest
@@ -119,7 +120,12 @@ def client(clock):
     rates = {"request": Rate(2, 60.0), "stream": Rate(1, 60.0), "upload": Rate(1_000, 3600.0)}
     limits = RateLimits(rates, time_s=clock)
     return TestClient(
-        RateGate(Starlette(routes=routes), limits=limits, actor=lambda scope: Headers(scope=scope).get("who"))
+        RateGate(
+            Starlette(routes=routes),
+            limits=limits,
+            actor=lambda scope: Headers(scope=scope).get("who"),
+            open_paths=("/livez",),
+        )
     )
 
 
@@ -176,14 +182,18 @@ def test_a_server_limits_addresses_before_it_looks_at_keys_and_each_key_on_any_a
     limited = Settings(host="0.0.0.0", keys_file=tmp_path / "keys.json", requests_per_min=3)
     app = create_app(limited, scenes={})
 
-    def statuses(address, headers, times):
+    def statuses(address, headers, times, path="/v1/scenes"):
         client = TestClient(app, base_url="http://192.0.2.1", client=(address, 1), raise_server_exceptions=False)
-        return [client.post("/v1/scenes", headers=headers).status_code for _ in range(times)]
+        return [client.post(path, headers=headers).status_code for _ in range(times)]
 
     good = {"Authorization": f"Bearer {key}"}
     guesses = {"Authorization": "Bearer nafir_000000000000_guess"}
     assert statuses("203.0.113.1", guesses, 5) == [401, 401, 401, 429, 429]
     assert statuses("203.0.113.2", good, 2) == [403, 403]
+    by_password = {"Authorization": f"Basic {base64.b64encode(b'x:nafir_000000000000_guess').decode()}"}
+    for number, path in enumerate(("/", "/main.js", "/readyz", "/openapi.json", "/v1/scenes")):
+        assert statuses(f"203.0.113.{10 + number}", by_password, 5, path) == [401, 401, 401, 429, 429]
+    assert statuses("203.0.113.20", by_password, 5, "/livez") == [405] * 5
     assert statuses("127.0.0.1", guesses, 5) == [401] * 5  # this machine, or a proxy on it
     other, _ = create_key(tmp_path / "keys.json", "", ["admin"], None)
     app = create_app(limited, scenes={})

@@ -26,7 +26,11 @@ const ANSWER_MS = 30_000; // a listener that is not there for so long after it w
 const MOST_ORDERS = 1024;
 const CLOCK_EVERY = 16; // blocks
 const NEEDS_KEY = 401;
+const FORBIDDEN = 403;
+const UPGRADE_REQUIRED = 426;
 const BUSY = 503;
+const OFTEN = 2; // a WebSocket may also fail for the moment
+const UNSENT = "This server needs a key for the sound, too: this browser sends the one that it asked you for with pages alone.";
 
 export const now = () => performance.timeOrigin + performance.now();
 
@@ -51,6 +55,7 @@ export class Stream {
   #heardAt = 0;
   #poseId = 0;
   #lastError = null;
+  #unsent = 0; // how often in a row a WebSocket was refused for want of a key that the browser sends with requests
   #comeBackMs = null; // after which a server without room said to come back
   #goOnMs = null; // after which one that shuts down said to go on
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
@@ -422,7 +427,10 @@ export class Stream {
     };
     socket.onmessage = ({ data }) => (typeof data === "string" ? this.#receive(JSON.parse(data)) : this.#receiveBlock(data));
     let isOpen = false;
-    socket.addEventListener("open", () => (isOpen = true));
+    socket.addEventListener("open", () => {
+      isOpen = true;
+      this.#unsent = 0;
+    });
     socket.onclose = ({ code, reason }) => (isOpen ? this.#lost(code, reason) : this.#unopened(socket, code, reason));
     this.#socket = socket;
     this.#heardAt = now();
@@ -432,15 +440,23 @@ export class Stream {
     }, 1000);
   }
 
-  // A browser does not tell why a WebSocket was refused. Asked by HTTP, the server says so, and when to come back if it has no room.
+  #ask(options = {}) {
+    return fetch(this.#url.replace(/^ws/, "http"), authorized({ cache: "no-store", ...options }, this.#key)).catch(() => null);
+  }
+
+  // A browser does not tell why a WebSocket was refused. Asked by HTTP, the server says so, and when to come back if it has no room. A key
+  // that its user gave the browser itself (HTTP Basic) comes with what is asked by HTTP; not every browser sends it with a WebSocket.
   async #unopened(socket, code, reason) {
-    const options = authorized({ cache: "no-store" }, this.#key);
-    const answer = await fetch(this.#url.replace(/^ws/, "http"), options).catch(() => null);
-    const problem = answer?.status === NEEDS_KEY ? await answer.json().catch(() => ({})) : null;
+    const answer = await this.#ask();
+    const problem = [NEEDS_KEY, FORBIDDEN].includes(answer?.status) ? await answer.json().catch(() => ({})) : {};
+    const needsAnother = answer?.status === NEEDS_KEY || problem.code === "scope_missing";
+    const isUnsent = answer?.status === UPGRADE_REQUIRED && this.#key === null && (await this.#ask({ credentials: "omit" }))?.status === NEEDS_KEY;
     if (this.#socket !== socket) return; // closed or renewed meanwhile
-    if (problem) {
+    this.#unsent = isUnsent ? this.#unsent + 1 : 0;
+    if (needsAnother || this.#unsent >= OFTEN) {
+      this.#unsent = 0;
       this.#detach(ENDED);
-      this.#listeners.state({ state: "refused", reason: problem.detail, needsKey: true });
+      this.#listeners.state({ state: "refused", reason: needsAnother ? problem.detail : UNSENT, needsKey: true });
       return;
     }
     if (answer?.status === BUSY) this.#comeBackMs = 1000 * Number(answer.headers.get("Retry-After")) || null;

@@ -11,10 +11,10 @@ from websockets.sync.client import connect
 pytestmark = pytest.mark.untimed
 
 
-def ask(address, path, **headers):
+def ask(address, path, *, method="GET", **headers):
     connection = http.client.HTTPConnection(address, timeout=10)
     try:
-        connection.putrequest("GET", path, skip_host=True)
+        connection.putrequest(method, path, skip_host=True)
         for name, value in {"Host": address, **headers}.items():
             connection.putheader(name.replace("_", "-"), value)
         connection.endheaders()
@@ -40,6 +40,10 @@ def test_a_page_of_another_site_may_neither_ask_nor_listen(served):
     assert ask(served, "/v1/scenes", Origin=f"http://{served}") == 200
     assert ask(served, "/v1/scenes", Origin=evil) == 403
     assert ask(served, "/v1/scenes", Sec_Fetch_Site="cross-site") == 403
+    for method in ("POST", "DELETE"):
+        for site in ("cross-site", "same-site"):
+            assert ask(served, "/v1/clips/x", method=method, Sec_Fetch_Site=site) == 403
+            assert ask(served, "/", method=method, Sec_Fetch_Site=site) == 403
     with pytest.raises(InvalidStatus) as refused, connect(f"ws://{served}/v1/stream", origin=evil):
         pass
     assert_refused(refused.value.response, 403, "origin_not_allowed")
