@@ -15,7 +15,9 @@ import kubernetes_validate
 import pytest
 import yaml
 
+from server.api.api_keys import create_key
 from server.api.settings import Settings
+from tests.serving import serving
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -238,6 +240,36 @@ def test_what_is_mounted_is_here():
                 assert source in compose()["volumes"]
         for each in service.get("secrets", ()):
             assert each in compose()["secrets"]
+
+
+def health_check():
+    """The command of the image's health check."""
+    (given,) = re.findall(r"^HEALTHCHECK .*\\\n\s+CMD (\[.*\])$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    return json.loads(given)
+
+
+def test_readiness_is_asked_for_over_loopback_where_it_needs_no_key():
+    """The node, and whatever else is outside of the container, would need one."""
+    assert container()["readinessProbe"]["exec"]["command"] == health_check()
+    assert "127.0.0.1" in health_check()[-1]
+    for name in ("startupProbe", "livenessProbe"):
+        assert container()[name]["httpGet"]["path"] == "/livez"
+    assert "NAFIR_PORT" not in of_kubernetes()  # the image's holds
+    assert int(image_variables()["NAFIR_PORT"]) == container()["ports"][0]["containerPort"]
+
+
+@pytest.mark.parametrize(("header", "status"), [(None, 0), ({"X-Forwarded-For": "203.0.113.7"}, 1)])
+def test_the_health_check_tells_whether_a_server_with_keys_is_ready(levels, hrtfs, tmp_path, header, status):
+    """It is not told what a proxy on the same machine asks."""
+    create_key(tmp_path / "keys.json", "", ["listen"], None)
+    program, flag, script = health_check()
+    if header is not None:
+        script = script.replace("'/readyz'", f"'/readyz', headers={header}")
+    with serving(levels, hrtfs, keys_file=tmp_path / "keys.json") as server:
+        environment = {**os.environ, "NAFIR_PORT": server.partition(":")[2]}
+        assert program == "python"
+        ran = subprocess.run([sys.executable, flag, script], env=environment, timeout=60, check=False)
+    assert ran.returncode == status
 
 
 def test_selectors_find_the_pods():

@@ -9,8 +9,9 @@
 # script's own, which is deleted at the end. podman and runc then run the image with a read-only root; the script waits
 # for /readyz, looks at the page, GETs an impulse response and checks that it is a stereo wav with sound in it, and walks
 # through the scene over WebSocket. In the house it asks for a response with a door shut and open, and opens that door in a
-# stream. Then podman-compose runs deploy/compose.yaml in its own networks, on ports 80 and 443: behind Caddy a key made
-# meanwhile opens the server, Prometheus reads its metrics, and a client listens through wss. Neither start compiles anything.
+# stream. Then podman-compose runs deploy/compose.yaml in its own networks, on ports 80 and 443: behind Caddy an outsider gets
+# nothing but /livez, a key made meanwhile opens the server, Prometheus reads its metrics, and a client listens through wss.
+# Neither start compiles anything.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback, where the image is tried alone
@@ -314,7 +315,8 @@ container=nafir-test_server_1
 tls=https://localhost
 authority=$state/root.crt
 until run_podman cp nafir-test_caddy_1:/data/caddy/pki/authorities/local/root.crt "$authority" 2>/dev/null &&
-    curl --silent --fail --output /dev/null --cacert "$authority" "$tls/readyz"; do
+    curl --silent --fail --output /dev/null --cacert "$authority" "$tls/livez" &&
+    run_podman exec "$container" "${check[@]}" 2>/dev/null; do
     ((SECONDS - started < 180)) || { cat "$state/compose.log"; run_podman logs "$container"; fail "not ready behind TLS after 180 s"; }
     sleep 0.5
 done
@@ -325,11 +327,16 @@ run_podman exec "$container" python -c 'open("/cache/probe", "w")' || fail "noth
 
 key=$(nafir_keys create --file /keys/keys.json --scope listen --scope render)
 status() { curl --silent --output /dev/null --write-out '%{http_code}' --cacert "$authority" "$@"; }
-[ "$(status "$tls/v1/scenes")" = 401 ] || fail "scenes are told without a key"
+for path in /v1/scenes /readyz / /main.js /docs /redoc /openapi.json; do
+    [ "$(status "$tls$path")" = 401 ] || fail "$path is told without a key"
+done
 made=$SECONDS
 until [ "$(status -H "Authorization: Bearer $key" "$tls/v1/scenes")" = 200 ]; do
     ((SECONDS - made < 20)) || fail "a key made while the server runs opens nothing after 20 s"
     sleep 0.5
+done
+for path in /readyz / /main.js /docs; do
+    [ "$(status --user "anybody:$key" "$tls$path")" = 200 ] || fail "a key given as a password does not open $path"
 done
 [ "$(status -H "Authorization: Bearer $(<"$secrets/metrics-key")" "$tls/metrics")" = 404 ] || fail "metrics can be read from outside"
 if [[ " ${services[*]} " = *" prometheus "* ]]; then
