@@ -307,6 +307,14 @@ def test_alerts_begin_when_they_should():
     run("promtool", "test", "rules", "alerts.test.yml", cwd=ALERTS.parent)
 
 
+def test_every_alert_says_what_to_do():
+    page = (ROOT / "docs" / "how-to" / "deploy.md").read_text()
+    rows = re.findall(r"^\| (`Nafir.*?) \|", page, re.MULTILINE)
+    explained = [name for row in rows for name in re.findall(r"`(Nafir\w+)`", row)]
+    alerts = [rule["alert"] for group in documents(ALERTS)[0]["groups"] for rule in group["rules"]]
+    assert sorted(explained) == sorted(alerts)
+
+
 def test_the_proxy_is_configured(tmp_path):
     environment = {**os.environ, "HOME": str(tmp_path), "DOMAIN": "sound.example"}
     run("caddy", "validate", "--adapter", "caddyfile", "--config", DEPLOY / "Caddyfile", env=environment)
