@@ -170,6 +170,24 @@ def test_the_dashboard_shows_who_is_there_and_what_they_get(name):
     assert any(re.search(rf"\b{name}\b", expression) for expression in shown)
 
 
+def test_only_times_are_drawn_in_seconds():
+    checked = 0
+    for panel in json.loads(DASHBOARD.read_text())["panels"]:
+        field = panel.get("fieldConfig", {})
+        if field.get("defaults", {}).get("unit") != "s":
+            continue
+        with_own_unit = {
+            override["matcher"]["options"]
+            for override in field["overrides"]
+            if any(each["id"] == "unit" for each in override["properties"])
+        }
+        for target in panel["targets"]:
+            is_time = bool(re.search(r"\bnafir_\w+_seconds(_bucket)?\b", target["expr"]))
+            assert is_time != (target["legendFormat"] in with_own_unit), (panel["title"], target["legendFormat"])
+            checked += 1
+    assert checked > 8
+
+
 def test_every_panel_has_its_place():
     panels = json.loads(DASHBOARD.read_text())["panels"]
     assert len({each["id"] for each in panels}) == len(panels)
@@ -270,6 +288,14 @@ def test_the_health_check_tells_whether_a_server_with_keys_is_ready(levels, hrtf
         assert program == "python"
         ran = subprocess.run([sys.executable, flag, script], env=environment, timeout=60, check=False)
     assert ran.returncode == status
+
+
+def test_folders_of_provisioning_that_grafana_brings_stay():
+    """It logs an error for each that is missing, as all are below a mount of the folder that holds them."""
+    targets = {each.split(":")[1] for each in compose()["services"]["grafana"]["volumes"]}
+    folders = sorted((DEPLOY / "grafana" / "provisioning").iterdir())
+    assert {f"/etc/grafana/provisioning/{folder.name}" for folder in folders} <= targets
+    assert "/etc/grafana/provisioning" not in targets
 
 
 def test_selectors_find_the_pods():

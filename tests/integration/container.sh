@@ -11,7 +11,8 @@
 # through the scene over WebSocket. In the house it asks for a response with a door shut and open, and opens that door in a
 # stream. Then podman-compose runs deploy/compose.yaml in its own networks, on ports 80 and 443: behind Caddy an outsider gets
 # nothing but /livez, a key made meanwhile opens the server, Prometheus reads its metrics, and a client listens through wss.
-# Neither start compiles anything.
+# Meanwhile every query of the dashboard is put to Prometheus: by Grafana, as its provisioning has set it up, where there is
+# one. Neither start compiles anything.
 #
 # Environment, all optional:
 #   PORT=8000            port on the host's loopback, where the image is tried alone
@@ -20,7 +21,8 @@
 #   CONTEXT=.            folder with the Dockerfile
 #   STATE=FOLDER         keep the image store and the base system here and use them again next time
 #   BASE_IMAGE=python:3.13-slim   DEBIAN_SUITE=trixie   DEBIAN_MIRROR=URL
-#   PULL_BASE=1          take BASE_IMAGE from its registry, not from mmdebstrap
+#   PULL_BASE=1          take BASE_IMAGE and those that compose.yaml names from their registries
+#   GRAFANA=FOLDER       a Grafana for Linux (bin/, conf/, public/, packaging/docker/run.sh), where its image cannot be had
 #   BUILD_MOUNTS="/a /b" host folders that pip needs during the build (local wheels, say), mounted read-only
 #   CA_BUNDLE=FILE       certificates for the build; the host's own by default
 set -euo pipefail
@@ -30,6 +32,7 @@ context=${CONTEXT:-$root}
 base=${BASE_IMAGE:-python:3.13-slim}
 image=nafir:container-test
 container=nafir-container-test
+listener=$container-listener
 port=${PORT:-8000}
 scene=${SCENE:-apartment}
 query=${QUERY:-listener=1,2,1.5&emitter=6,3,1.5&yaw_deg=90}
@@ -62,7 +65,7 @@ tear_down() {
         run_compose down --volumes || true
         run_podman network rm --force nafir-test_front nafir-test_proxied nafir-test_inside >/dev/null 2>&1 || true
     fi
-    run_podman rm --force --ignore "$container" >/dev/null 2>&1 || true
+    run_podman rm --force --ignore "$container" "$listener" >/dev/null 2>&1 || true
     if [ -z "$keep" ]; then
         run_podman rmi --all --force >/dev/null 2>&1 || true
         rm -rf "$state"
@@ -247,7 +250,7 @@ PYTHON
 stop_server
 
 # deploy/compose.yaml itself, in its own networks. Images that it names are pulled with PULL_BASE=1, or made of the base and the
-# program of this name that the host has; a service without either is left out.
+# program of this name that the host has, Grafana's of the folder GRAFANA; a service without either is left out.
 say "running deploy/compose.yaml"
 ! curl --silent --output /dev/null http://127.0.0.1:80 || fail "port 80, which Caddy takes, is in use"
 deploy=$state/deploy
@@ -263,8 +266,8 @@ chmod 644 "$secrets/keys/keys.json" "$secrets/metrics-key" "$secrets/grafana-pas
 
 make_image() {
     mkdir -p "$state/$1"
-    cp "$(command -v "$1")" "$state/$1/program"
-    printf 'FROM localhost/%s\nCOPY program /usr/bin/%s\n%s\n' "$base" "$1" "$3" >"$state/$1/Dockerfile"
+    cp --recursive --no-target-directory "$3" "$state/$1/files"
+    printf 'FROM localhost/%s\nCOPY files %s\n%s\n' "$base" "$4" "$5" >"$state/$1/Dockerfile"
     buildah "${store[@]}" bud --quiet --isolation chroot --format docker --pull-never --tag "$2" "$state/$1" >/dev/null
 }
 services=(server)
@@ -278,12 +281,24 @@ for wanted in $(sed -n 's/^ *image: \([a-z]\)/\1/p' "$deploy/compose.yaml"); do
     elif [ -n "${PULL_BASE:-}" ]; then
         run_podman pull --quiet "$wanted"
     elif [ "$service" = caddy ] && command -v caddy >/dev/null; then
-        make_image caddy "$wanted" 'ENV XDG_DATA_HOME=/data XDG_CONFIG_HOME=/config
+        make_image caddy "$wanted" "$(command -v caddy)" /usr/bin/caddy 'ENV XDG_DATA_HOME=/data XDG_CONFIG_HOME=/config
 CMD ["caddy", "run", "--config", "/etc/caddy/Caddyfile", "--adapter", "caddyfile"]'
     elif [ "$service" = prometheus ] && command -v prometheus >/dev/null; then
-        make_image prometheus "$wanted" 'RUN mkdir /prometheus && chown 65534:65534 /prometheus
+        make_image prometheus "$wanted" "$(command -v prometheus)" /usr/bin/prometheus 'RUN mkdir /prometheus && chown 65534:65534 /prometheus
 USER 65534
 ENTRYPOINT ["prometheus"]'
+    elif [ "$service" = grafana ] && [ -n "${GRAFANA:-}" ]; then
+        [[ " ${services[*]} " = *" prometheus "* ]] || fail "prometheus, which Grafana asks, is not installed"
+        # The paths, the user and the start script of Grafana's own image.
+        make_image grafana "$wanted" "$GRAFANA" /usr/share/grafana 'ENV GF_PATHS_CONFIG=/etc/grafana/grafana.ini \
+    GF_PATHS_HOME=/usr/share/grafana GF_PATHS_DATA=/var/lib/grafana GF_PATHS_LOGS=/var/log/grafana \
+    GF_PATHS_PLUGINS=/var/lib/grafana/plugins GF_PATHS_PROVISIONING=/etc/grafana/provisioning \
+    PATH=/usr/share/grafana/bin:/usr/sbin:/usr/bin:/sbin:/bin
+RUN mkdir -p /etc/grafana /var/lib/grafana/plugins /var/log/grafana && cp /usr/share/grafana/conf/sample.ini /etc/grafana/grafana.ini \
+    && cp --recursive /usr/share/grafana/conf/provisioning /etc/grafana \
+    && chown -R 472:0 /var/lib/grafana /var/log/grafana
+USER 472
+ENTRYPOINT ["bash", "/usr/share/grafana/packaging/docker/run.sh"]'
     else
         echo "$service is left out: it has no image"
         continue
@@ -291,6 +306,7 @@ ENTRYPOINT ["prometheus"]'
     services+=("$service")
 done
 [[ " ${services[*]} " = *" caddy "* ]] || fail "caddy is not installed"
+[[ " ${services[*]} " != *" grafana "* ]] || ! curl --silent --output /dev/null http://127.0.0.1:3000 || fail "port 3000, which Grafana takes, is in use"
 
 # podman-compose's podman: the store of this script, and the limits that this host can give.
 printf '[containers]\ndefault_ulimits = ["nofile=1024:1024", "nproc=4096:4096"]\n' >"$state/containers.conf"
@@ -355,9 +371,12 @@ print("Prometheus reads", targets[0]["scrapeUrl"])
 fi
 # From outside the networks of compose, through the port of Caddy, by a user who is not root.
 chmod 644 "$authority"
-run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$root/client_examples/python/nafir_client:/client/nafir_client:ro" \
-    --volume "$authority:/client/root.crt:ro" --workdir /client --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/client/root.crt \
-    --entrypoint python "$image" -c '
+run_client() {
+    run_podman run --rm --no-healthcheck --network host "${ulimits[@]}" --volume "$root/client_examples/python/nafir_client:/client/nafir_client:ro" \
+        --volume "$authority:/client/root.crt:ro" --workdir /client --env "NAFIR_API_KEY=$key" --env SSL_CERT_FILE=/client/root.crt \
+        --entrypoint python "$@"
+}
+run_client "$image" -c '
 import sys
 
 import soundfile
@@ -373,6 +392,29 @@ peak = abs(samples).max()
 print(f"{len(samples) / rate:.2f} s heard through wss, peak {peak:.4f}")
 assert len(samples) > 2 * rate and 0.001 < peak <= 1, "silence"
 ' listen wss://localhost --scene "$scene" --seconds 3 --silent --output /dev/shm/heard.wav
+
+if [[ " ${services[*]} " = *" prometheus "* ]]; then
+    say "putting the dashboard's queries to Prometheus"
+    grafana_password=
+    [[ " ${services[*]} " != *" grafana "* ]] || grafana_password=$(<"$secrets/grafana-password")
+    if [ -n "$grafana_password" ]; then
+        started=$SECONDS
+        # By the port that compose publishes.
+        until get --output "$state/grafana.json" http://127.0.0.1:3000/api/health 2>/dev/null; do
+            ((SECONDS - started < 120)) || { run_podman logs nafir-test_grafana_1; fail "Grafana is not healthy after 120 s"; }
+            sleep 0.5
+        done
+        echo "Grafana is healthy: $(tr -d '\n' <"$state/grafana.json")"
+    fi
+    run_client --detach --name "$listener" "$image" -c 'from nafir_client.command_line import main; main()' \
+        listen wss://localhost --scene "$scene" --seconds 120 --silent --output /dev/shm/heard.wav >/dev/null
+    run_podman exec --interactive "$container" python - "$grafana_password" "$(<"$deploy/grafana/nafir.json")" <"$root/tests/integration/dashboard.py" ||
+        { [ -z "$grafana_password" ] || run_podman logs nafir-test_grafana_1; run_podman logs "$listener" || true; fail "the dashboard"; }
+    run_podman stop --time 10 "$listener" >/dev/null
+    if [ -n "$grafana_password" ] && run_podman logs nafir-test_grafana_1 2>&1 | grep logger=provisioning | grep --extended-regexp '(lvl=eror|level=error)'; then
+        fail "Grafana complains about its provisioning"
+    fi
+fi
 
 say "stopping it"
 started=$SECONDS
