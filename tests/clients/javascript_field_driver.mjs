@@ -10,14 +10,17 @@ const load = (name) => import(pathToFileURL(join(folder, "field", name)).href);
 const { Field, readRows } = await load("field.js");
 const { Network } = await load("network.js");
 const { inverse, transform } = await load("fourier.js");
-const { LocalStream, BLOCK } = await load("local_stream.js");
+const { LocalStream } = await load("local_stream.js");
 const { Convolver, spectraOf } = await load("renderer.js");
+const { Resampler } = await load("resampler.js");
+const { blockSizeAt } = await load("../wire.js");
 const bytesOf = (path) => new Uint8Array(readFileSync(path));
 
-const open = ({ bundle, graph, noises, level }) =>
+const open = ({ bundle, graph, noises, level, sampleRate }) =>
   new Field({
     manifest: JSON.parse(readFileSync(join(bundle, "scene.json"), "utf8")),
     level: level ?? undefined,
+    sampleRate: sampleRate ?? undefined,
     graph: graph && bytesOf(join(bundle, graph)),
     noises: noises && readRows(bytesOf(noises)),
   });
@@ -46,8 +49,21 @@ function spectrum({ re, im }) {
   return { there, back: [Array.from(a), Array.from(b)] };
 }
 
+/** Resamples a file of float32 with a number of channels, one after the other. */
+function resample({ signal, channels: count, from, to, into }) {
+  const all = new Float32Array(bytesOf(signal).buffer);
+  const samples = all.length / count;
+  const channels = Array.from({ length: count }, (_, k) => all.subarray(k * samples, (k + 1) * samples));
+  const resampler = new Resampler({ from, to, samples });
+  const resampled = new Float32Array(count * resampler.samples);
+  resampler.resample(channels).forEach((channel, k) => resampled.set(channel, k * resampler.samples));
+  writeFileSync(into, resampled);
+  return { samples: resampler.samples };
+}
+
 /** A field_worker.js that answers at once. */
 function answerer(field, stream) {
+  const block = blockSizeAt(field.sampleRate);
   return ({ type, id, poseId, listener, emitter }) => {
     if (type === "open") {
       const longestS = field.longestM / field.speedOfSound;
@@ -65,15 +81,16 @@ function answerer(field, stream) {
     const filter = field.directFilter({ lengthM, gainDb });
     const delay = (lengthM / field.speedOfSound) * field.sampleRate;
     stream().receive({ type: "path", id, poseId, path: { delay, filter, gains: [1, y, z, x] } });
-    stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), BLOCK), ms: 1 });
+    stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), block), ms: 1 });
   };
 }
 
 /** Renders blocks; `script` has the commands before a block, by its number. The clip is a file of float32, and comes after `soundAfter` ticks. */
 function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
   const field = open(opened);
+  const size = blockSizeAt(field.sampleRate);
   const told = { posed: [], refused: [], state: [], status: [], heard: [] };
-  const samples = new Float32Array(4 * blocks * BLOCK);
+  const samples = new Float32Array(4 * blocks * size);
   let time = 1000;
   const { process } = Convolver.prototype;
   let convolved = 0; // in this block
@@ -94,7 +111,7 @@ function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
   let rendered = 0;
   const block = ({ channels, poseId, reverberationPoseId, late }) => {
     told.heard.push([poseId, reverberationPoseId, late]);
-    if (rendered < blocks) channels.forEach((channel, k) => samples.set(channel, k * blocks * BLOCK + rendered * BLOCK));
+    if (rendered < blocks) channels.forEach((channel, k) => samples.set(channel, k * blocks * size + rendered * size));
     rendered += 1;
     if (rendered > 1) most = Math.max(most, convolved); // what was rehearsed comes before the first
     convolved = 0;
@@ -118,14 +135,14 @@ function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
     if (clip && ticks === soundAfter) local.setSound({ name: "clip", samples: new Float32Array(bytesOf(clip).buffer) });
     local.tick();
     if (rendered > 0) begun ??= { ticks, atOnce: rendered };
-    time += (1000 * BLOCK) / field.sampleRate;
+    time += (1000 * size) / field.sampleRate;
   }
   Convolver.prototype.process = process;
   writeFileSync(into, samples);
-  return { ...told, block: BLOCK, rendered, begun, most };
+  return { ...told, block: size, rendered, begun, most };
 }
 
-const TASKS = { respond, run, spectrum, stream };
+const TASKS = { respond, run, spectrum, resample, stream };
 const results = JSON.parse(readFileSync(jobFile, "utf8")).map(({ task, ...job }) => {
   try {
     return TASKS[task](job);

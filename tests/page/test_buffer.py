@@ -1,4 +1,5 @@
-"""What the player's buffer promises, on a simulated clock: blocks of 256 come in, quanta of 128 go out, at 24 kHz."""
+"""What the player's buffer promises, on a simulated clock: blocks of 256 come in, quanta of 128 go out, at 24 kHz, or
+blocks of 512 at 48 kHz."""
 
 import base64
 import math
@@ -14,9 +15,9 @@ one_page = visitor.one_page
 pytestmark = visitor.needs_browser
 
 
-SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0 }) => {
+SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0, rate = 24_000 }) => {
   const { JitterBuffer } = await import(new URL("nafir/jitterbuffer.js", document.baseURI));
-  const rate = 24_000;
+  const size = (256 * rate) / 24_000;
   const buffer = new JitterBuffer({ sampleRate: rate });
   const tone = (n) => 0.5 * Math.sin((2 * Math.PI * 220 * n) / rate);
   const played = [];
@@ -30,14 +31,14 @@ SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0 }) => {
     // The sender's clock runs `skew` fast; a block leaves when it is whole and comes in order after its delay, and
     // `spacing` after the one before at the soonest.
     for (;;) {
-      const delay = stalls[sent / 256] ?? (delays.length ? delays[(sent / 256) % delays.length] : 0);
-      const arrival = Math.max((sent + 256) / (1 + skew) + delay * rate, last + spacing * rate);
+      const delay = stalls[sent / size] ?? (delays.length ? delays[(sent / size) % delays.length] : 0);
+      const arrival = Math.max((sent + size) / (1 + skew) + delay * rate, last + spacing * rate);
       if (arrival > now) break;
       last = arrival;
-      const left = Float32Array.from({ length: 256 }, (_, i) => tone(sent + i));
+      const left = Float32Array.from({ length: size }, (_, i) => tone(sent + i));
       const channels = [left, left.map((value) => -value)];
-      buffer.push({ channels, sampleClock: sent, poseId: sent / 256, late: false });
-      sent += 256;
+      buffer.push({ channels, sampleClock: sent, poseId: sent / size, late: false });
+      sent += size;
     }
     const left = new Float32Array(128);
     const right = new Float32Array(128);
@@ -68,11 +69,12 @@ def simulate(page, parameters: dict[str, object]) -> dict[str, Any]:
     return run | series | {"heard": series["heard"].reshape(-1, 2)}
 
 
-def tone(samples: np.ndarray) -> np.ndarray:
-    return 0.5 * np.sin(2 * np.pi * 220 * samples / 24_000)
+def tone(samples: np.ndarray, rate: int) -> np.ndarray:
+    return 0.5 * np.sin(2 * np.pi * 220 * samples / rate)
 
 
 STEEPEST_TONE = 0.5 * 2 * math.pi * 220 / 24_000
+RATES = pytest.mark.parametrize("rate", [24_000, 48_000])
 
 
 SETTLED_S = 25
@@ -80,18 +82,20 @@ SETTLED_S = 25
 QUANTA_PER_S = 24_000 / 128
 
 
-def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has_settled(one_page):
-    run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": []})
+@RATES
+def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has_settled(one_page, rate):
+    run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": [], "rate": rate})
+    size = 256 * rate // 24_000
     assert run["counters"]["underruns"] == 0
     assert run["counters"]["splices"] > 0
-    assert run["steepest"] < 1.5 * STEEPEST_TONE
+    assert run["steepest"] < 1.5 * STEEPEST_TONE * 24_000 / rate
     # Pose n is heard with the first sample of block n, and so says where in the tone the output is.
     pose, at = run["heard"][-1]
-    delay = at - 256 * pose
-    assert 0.02 < delay / 24_000 < 0.045
-    assert all(at - 256 * pose == delay for pose, at in run["heard"] if at > SETTLED_S * 24_000)
+    delay = at - size * pose
+    assert 0.02 < delay / rate < 0.045
+    assert all(at - size * pose == delay for pose, at in run["heard"] if at > SETTLED_S * rate)
     played, first = run["played"], run["before"]
-    np.testing.assert_allclose(played, tone(np.arange(first, first + len(played)) - delay), atol=1e-7)
+    np.testing.assert_allclose(played, tone(np.arange(first, first + len(played)) - delay, rate), atol=1e-7)
 
 
 def test_a_stall_while_everything_starts_is_not_heard(one_page):
@@ -118,13 +122,14 @@ def test_after_a_dropout_the_buffer_comes_back_to_its_aim(one_page, block, stall
     assert run["steepest"] < 1.5 * STEEPEST_TONE
 
 
+@RATES
 @pytest.mark.parametrize("skew", [1e-3, -1e-3])
-def test_clock_drift_is_absorbed_without_dropouts_or_clicks(one_page, skew):
-    run = simulate(one_page, {"seconds": 50, "skew": skew, "delays": []})
+def test_clock_drift_is_absorbed_without_dropouts_or_clicks(one_page, skew, rate):
+    run = simulate(one_page, {"seconds": 50, "skew": skew, "delays": [], "rate": rate})
     assert run["counters"]["underruns"] == run["counters"]["gaps"] == run["counters"]["overflows"] == 0
     assert run["counters"]["splices"] > 0
     assert max(run["fills"][-2000:]) < 0.1
-    assert run["steepest"] < 1.5 * STEEPEST_TONE
+    assert run["steepest"] < 1.5 * STEEPEST_TONE * 24_000 / rate
 
 
 def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(one_page):

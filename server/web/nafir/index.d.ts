@@ -225,7 +225,7 @@ export interface ConnectOptions {
   bufferBlocks?: number;
   /** How many listeners there will be, the first included, so that the server keeps room for them. */
   listeners?: number;
-  /** "here": the field runs in this browser, in ambisonics of the first order, in a context of the scene's own rate. */
+  /** "here": the field runs in this browser, in ambisonics of the first order. */
   rendered?: "server" | "here";
   /** Ends the attempt. */
   signal?: AbortSignal;

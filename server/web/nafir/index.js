@@ -484,13 +484,13 @@ class Nafir extends EventTarget {
  * Opens a stream of a server and makes an AudioNode of it. Resolves when the server has welcomed it; while the server cannot be reached or
  * has no room, it is tried again. Rejects with RefusedError if the server refuses it.
  *
- * `context` is an AudioContext of 44.1, 48 or 96 kHz, or of the scene's own rate. `url` is the server's address. Options: `scene`; `key`;
- * `listener` ({position, yaw or orientation}; without it, where a visit of the scene begins); `level`; `effects`; `head`; `order` (1 to 3:
- * the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32"; "s16", half as many bytes; or "opus", a tenth,
- * which is "s16" where server, browser or rate do not allow it: `welcome.encoding` says so); `opus` (its options); `bufferBlocks`;
- * `listeners` (how many there will be, the first included, so that the server keeps room for them);
- * `rendered` ("here": the field runs in this browser, in first-order ambisonics at the scene's own rate, and the server has nothing more to
- * do; only levels whose field knows directions can); `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
+ * The stream has the rate of `context`, an AudioContext of 44.1, 48 or 96 kHz, or of the scene's own rate. `url` is the server's address.
+ * Options: `scene`; `key`; `listener` ({position, yaw or orientation}; without it, where a visit of the scene begins); `level`; `effects`;
+ * `head`; `order` (1 to 3: the stream is ambisonic, and turns of the head are heard at once); `encoding` ("f32"; "s16", half as many bytes;
+ * or "opus", a tenth, which is "s16" where server, browser or rate do not allow it: `welcome.encoding` says so); `opus` (its options);
+ * `bufferBlocks`; `listeners` (how many there will be, the first included, so that the server keeps room for them); `rendered` ("here": the
+ * field runs in this browser, in first-order ambisonics, and the server has nothing more to do; only levels whose field knows directions
+ * can); `signal` (an AbortSignal that ends the attempt); `assets` (where this package's files are, for bundlers that move them).
  */
 export async function connect(context, url, options) {
   const { key = null, signal, assets, listener, rendered = "server" } = options;

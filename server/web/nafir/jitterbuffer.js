@@ -25,8 +25,8 @@ const MAX_HEADROOM_S = 0.25;
 const SLACK_S = 0.006; // the buffer is shortened only if the fill is this far above the headroom
 const GROWTH_S = 0.015; // each dropout increases the headroom by this much, some of which is given back in each window
 const GIVEN_BACK_S = 0.0002;
-const SHORTEST_LAG = 48;
-const LONGEST_LAG = 288;
+const SHORTEST_LAG_S = 0.002; // of a splice
+const LONGEST_LAG_S = 0.012; // a period of the deepest voices, at every rate
 const INAUDIBLE = 1e-4; // sum of squares over a quantum of the first two channels, 60 dB below full scale
 
 const raisedCosine = (length) => Float32Array.from({ length }, (_, i) => 0.5 - 0.5 * Math.cos((Math.PI * (i + 0.5)) / length));
@@ -214,7 +214,8 @@ export class JitterBuffer {
   #bestLag(sign, limit) {
     const [first, second] = this.rings; // of ambisonics, the sound from everywhere and that from the side
     const differences = [];
-    for (let lag = SHORTEST_LAG; lag <= Math.min(LONGEST_LAG, limit); lag++) {
+    const shortest = Math.round(SHORTEST_LAG_S * this.sampleRate);
+    for (let lag = shortest; lag <= Math.min(LONGEST_LAG_S * this.sampleRate, limit); lag++) {
       const shift = sign * lag;
       if (shift > 0 && this.fill < QUANTUM + shift + RESERVE) break;
       if (shift < 0 && this.read + shift < 0) break;
@@ -228,7 +229,7 @@ export class JitterBuffer {
     }
     const enough = 1.1 * Math.min(...differences) + INAUDIBLE;
     const at = differences.findLastIndex((difference) => difference <= enough);
-    return at < 0 ? 0 : sign * (SHORTEST_LAG + at);
+    return at < 0 ? 0 : sign * (shortest + at);
   }
 
   #splice(outputs, lag) {

@@ -69,6 +69,9 @@ export function serializeDryPacket({ id, sequence, frames, packet }) {
 /** Whether a binary message is an audio block; a newer server may send other kinds. */
 export const isBlock = (buffer) => buffer.byteLength > 0 && new DataView(buffer).getUint8(0) === AUDIO_BLOCK;
 
+/** Frames of a block at a sample rate: it lasts about 10 ms, so that poses are heard and partitions are cut as they are at 24 kHz. */
+export const blockSizeAt = (sampleRate) => (sampleRate < 36_000 ? 256 : sampleRate < 72_000 ? 512 : 1024);
+
 function parseHeader(view) {
   if (view.byteLength < BLOCK_HEADER_BYTES || view.getUint8(0) !== AUDIO_BLOCK) throw new TypeError("not an audio block");
   return {
@@ -125,8 +128,8 @@ export function parsePackets(buffer) {
 export const message = {
   hello: ({ scene, sampleRate, encoding = "f32", opus, level, effects, output, order, head, bufferBlocks, listener, emitters, listeners, doors }) =>
     JSON.stringify({
-      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, encoding, opus, level, effects, output, order, hrtf: head,
-      buffer_blocks: bufferBlocks, listener, emitters, listeners, doors, snapshots: true,
+      type: "hello", protocol: PROTOCOL, scene, sample_rate: sampleRate, block_size: sampleRate && blockSizeAt(sampleRate), encoding, opus, level,
+      effects, output, order, hrtf: head, buffer_blocks: bufferBlocks, listener, emitters, listeners, doors, snapshots: true,
     }),
   resume: ({ token, snapshot, sequence, sampleClock }) =>
     JSON.stringify({ type: "resume", protocol: PROTOCOL, token, snapshot, sequence, sample_clock: sampleClock }),

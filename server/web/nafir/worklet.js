@@ -7,7 +7,7 @@ import { JitterBuffer } from "./jitterbuffer.js";
 
 const QUANTUM = 128; // samples that the Web Audio API processes at once
 const BLOCK = 256; // samples of a live emitter that are sent at once
-const REPORT_QUANTA = 5; // about 27 ms at 24 kHz
+const REPORT_QUANTA = Math.round((0.027 * sampleRate) / QUANTUM);
 const TAP_S = 12;
 
 /** The playback of a stream of ambisonics of this order, or of two ears if it is null. `channels` are what its buffer gave last. */

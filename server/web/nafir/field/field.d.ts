@@ -15,6 +15,8 @@ export interface DirectPath {
 export interface FieldOptions {
   /** One of the scene's quality levels whose field knows directions; without it, the first of them. */
   level?: string;
+  /** Of responses; without it, the scene's own. */
+  sampleRate?: number;
   /** An API key or token with the scope `render`, if the server asks for one. */
   key?: string | null;
   signal?: AbortSignal;
@@ -22,10 +24,10 @@ export interface FieldOptions {
 
 /** A trained field of a scene, computed here: after `load` no server is needed. A response takes milliseconds, so call it in a worker. */
 export class Field {
-  /** Fetches the manifest, one graph and the noises. Throws RequestError, and Error for a scene that cannot be computed here. */
+  /** Fetches the manifest, one graph and the noises. Throws RequestError, Error for a scene that cannot be computed here, and RangeError for what is no sampleRate. */
   static load(server: string | URL, scene: string, options?: FieldOptions): Promise<Field>;
   /** Of what `load` fetches: scene.json, the ONNX file of the level's field, and the rows of the noises. */
-  constructor(parts: { manifest: object; level?: string; graph?: Uint8Array | null; noises?: readonly Float32Array[] | null });
+  constructor(parts: { manifest: object; level?: string; sampleRate?: number; graph?: Uint8Array | null; noises?: readonly Float32Array[] | null });
   readonly level: string;
   readonly sampleRate: number;
   /** Samples of a response. */

@@ -1,5 +1,6 @@
 // A trained field of a scene, in this browser: from the bundle of a server, it computes impulse responses as first-order ambisonics (ACN
-// order, SN3D norm), the samples of the server's own `impulse-response?output=ambisonics`.
+// order, SN3D norm), the samples of the server's own `impulse-response?output=ambisonics`. At another `sampleRate` than the scene's they are
+// those that the server convolves in streams of this rate.
 //
 //   const field = await Field.load("https://sound.example", "apartment");
 //   const [w, y, z, x] = field.response([2.2, 2, 1.6], [6.2, 3.2, 1.5]);
@@ -14,6 +15,7 @@ import { FloorPlan, OCTAVE_BANDS_HZ } from "./floor_plan.js";
 import { Gate } from "./gate.js";
 import { Network } from "./network.js";
 import { absorptionDbPerM, PlaneWaves } from "./plane_waves.js";
+import { Resampler } from "./resampler.js";
 
 const EAR_AHEAD_S = 0.00026; // sound reaches the nearer ear at most this much before the middle of the head
 const LEAST_POWER = 1e-10;
@@ -66,26 +68,33 @@ export class Field {
   #mirrorsDb = null;
   #wallLossDb = null;
   #knownHarmonics = 0;
+  #ownRate; // of what the network's output is decoded to
+  #ownSamples;
+  #resampler = null; // from that to the rate of responses; null if it is the same
 
   /**
    * Fetches what a field needs from a server, with the address of it or of its v1/: the manifest, one graph, and the noises. Throws
-   * RequestError where the server refuses, and Error for a scene that cannot be computed here.
+   * RequestError where the server refuses, Error for a scene that cannot be computed here, and RangeError for what is no `sampleRate`.
    */
-  static async load(server, scene, { level, key = null, signal } = {}) {
+  static async load(server, scene, { level, sampleRate, key = null, signal } = {}) {
     const at = new URL(`scenes/${encodeURIComponent(scene)}/`, apiOf(server));
     const manifest = await fetchJson(new URL("bundle/scene.json", at), { key, signal });
     const { name, field } = levelOf(manifest, level);
-    if (field === "none") return new Field({ manifest, level });
+    if (field === "none") return new Field({ manifest, level, sampleRate });
     const noisesUrl = new URL(`ambisonic-noises?order=${ORDER}&level=${encodeURIComponent(name)}`, at);
     const [graph, noises] = await Promise.all([
       fetchBytes(new URL(`bundle/${encodeURIComponent(manifest.fields[field].file)}`, at), { key, signal }),
       fetchBytes(noisesUrl, { key, signal }),
     ]);
-    return new Field({ manifest, level, graph, noises: readRows(noises) });
+    return new Field({ manifest, level, sampleRate, graph, noises: readRows(noises) });
   }
 
-  /** `manifest` is scene.json, `graph` (Uint8Array) the ONNX file of the level's field, `noises` the rows of GET ambisonic-noises. */
-  constructor({ manifest, level: name, graph = null, noises = null }) {
+  /**
+   * `manifest` is scene.json, `graph` (Uint8Array) the ONNX file of the level's field, `noises` the rows of GET ambisonic-noises. Responses have
+   * the `sampleRate`, by default the scene's own.
+   */
+  constructor({ manifest, level: name, sampleRate = manifest.codec.sample_rate, graph = null, noises = null }) {
+    if (!Number.isInteger(sampleRate) || sampleRate < 1) throw new RangeError(`sampleRate: has to be a whole number of Hz, not ${sampleRate}`);
     const level = levelOf(manifest, name);
     const file = manifest.fields[level.field];
     const { speed_of_sound: speedOfSound = 343, image_order: imageOrder = 0 } = manifest;
@@ -94,9 +103,11 @@ export class Field {
     this.#plan = planOf(manifest);
     this.#parameters = file?.codec ?? manifest.codec;
     this.speedOfSound = speedOfSound;
-    this.sampleRate = this.#parameters.sample_rate;
+    this.sampleRate = sampleRate;
+    [this.#ownRate, this.#ownSamples] = [manifest.codec.sample_rate, manifest.codec.samples];
+    if (sampleRate !== this.#ownRate) this.#resampler = new Resampler({ from: this.#ownRate, to: sampleRate, samples: this.#ownSamples });
     /** Samples of a response. */
-    this.samples = manifest.codec.samples;
+    this.samples = this.#resampler?.samples ?? this.#ownSamples;
     this.#waves = new PlaneWaves({ sampleRate: this.sampleRate, speedOfSound, airDbPerM: absorptionDbPerM(manifest.air) });
     if (imageOrder > 0) {
       const { walls, floor, ceiling } = manifest.geometry.materials;
@@ -105,7 +116,7 @@ export class Field {
       if (manifest.transmission && mass !== null) this.#wallLossDb = wallLossDb(mass);
     }
     if (!file) return;
-    if (this.sampleRate !== manifest.codec.sample_rate) throw new Error(`level ${level.name} has a sample rate of its own`);
+    if (this.#parameters.sample_rate !== this.#ownRate) throw new Error(`level ${level.name} has a sample rate of its own`);
     this.#network = new Network(graph);
     const known = level.order === null || level.order === undefined ? file.order : Math.min(level.order, file.order);
     this.#knownHarmonics = (known + 1) ** 2 - 1;
@@ -177,13 +188,13 @@ export class Field {
     const { columns } = this.#reverberation;
     if (levels.data.length !== OCTAVE_BANDS_HZ.length * columns) throw new Error("the graph does not fit the manifest");
     const lead = this.#parameters.lead_samples;
-    const aligned = (path.lengthM / this.speedOfSound) * this.sampleRate - lead;
+    const aligned = (path.lengthM / this.speedOfSound) * this.#ownRate - lead;
     if (!Number.isFinite(aligned)) throw new RangeError("no way leads from emitter to listener");
     const harmonics = directions?.data.subarray(0, this.#knownHarmonics * levels.data.length) ?? new Float32Array(0);
-    const channels = this.#reverberation.decode({ logMagnitude: levels.data, directions: harmonics }, aligned, this.samples);
+    const channels = this.#reverberation.decode({ logMagnitude: levels.data, directions: harmonics }, aligned, this.#ownSamples);
     const echoS = this.#plan.firstEchoM(listener, emitter) / this.speedOfSound;
-    this.#gate.open(channels, Math.floor(aligned) + lead, Math.floor((echoS - EAR_AHEAD_S) * this.sampleRate));
-    return channels;
+    this.#gate.open(channels, Math.floor(aligned) + lead, Math.floor((echoS - EAR_AHEAD_S) * this.#ownRate));
+    return this.#resampler?.resample(channels) ?? channels;
   }
 
   #addThroughWalls(listener, emitter, channels) {

@@ -15,10 +15,7 @@ let isBusy = false;
 
 async function open({ server, scene, level, key, sampleRate, block }) {
   try {
-    field = await Field.load(server, scene, { level, key });
-    if (field.sampleRate !== sampleRate) {
-      throw new Error(`the field of scene ${scene} has ${field.sampleRate} Hz: open the AudioContext with this rate, not with ${sampleRate}`);
-    }
+    field = await Field.load(server, scene, { level, sampleRate, key });
     quantum = block;
     const longestS = field.longestM / field.speedOfSound;
     const { listener, emitter } = field.start;

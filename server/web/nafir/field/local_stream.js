@@ -1,10 +1,10 @@
 // A stream that no server renders: what Stream is for a server's, with blocks that are computed here, from a field in a worker beside it. It
 // does no I/O but messages to that worker, and reads its clock from outside, so that tests can drive it.
 
+import { blockSizeAt } from "../wire.js";
 import { Convolver, DirectSound } from "./renderer.js";
 import { ClipSource, LiveSource } from "./sources.js";
 
-export const BLOCK = 256; // samples
 const CHANNELS = 4;
 const MOST_EMITTERS = 8;
 const BEHIND_S = 0.2; // of blocks that are late; more are left out
@@ -24,8 +24,8 @@ class LocalEmitter {
   #shape;
   #direct;
   #convolver;
-  #input = new Float32Array(BLOCK);
-  #silence = new Float32Array(BLOCK);
+  #input;
+  #silence;
   #amplitude = null; // null before the first block
   wanted = {}; // what the page wants of it
   asked = -1; // newest pose for which the field was asked
@@ -36,9 +36,10 @@ class LocalEmitter {
   constructor(shape, source) {
     this.#shape = shape;
     this.source = source;
-    const { samples, taps, longestS, sampleRate } = shape;
-    this.#direct = new DirectSound({ quantum: BLOCK, sampleRate, taps, longestS: Math.max(SHORTEST_S, longestS) });
-    this.#convolver = new Convolver({ samples, quantum: BLOCK });
+    const { block, samples, taps, longestS, sampleRate } = shape;
+    [this.#input, this.#silence] = [new Float32Array(block), new Float32Array(block)];
+    this.#direct = new DirectSound({ quantum: block, sampleRate, taps, longestS: Math.max(SHORTEST_S, longestS) });
+    this.#convolver = new Convolver({ samples, quantum: block });
   }
 
   follow(path) {
@@ -66,7 +67,8 @@ class LocalEmitter {
   }
 
   end() {
-    this.ending = Math.ceil((this.#shape.samples + this.#shape.longestS * this.#shape.sampleRate) / BLOCK) + 1;
+    const { block, samples, longestS, sampleRate } = this.#shape;
+    this.ending = Math.ceil((samples + longestS * sampleRate) / block) + 1;
   }
 
   /** Adds a block to the channels. Returns spectra that are no longer needed, or null. */
@@ -74,7 +76,8 @@ class LocalEmitter {
     const target = this.ending === null ? amplitudeOf(this.wanted.gainDb) : 0;
     const before = this.#amplitude ?? target;
     this.source.read(this.#input);
-    for (let i = 0; i < BLOCK; i++) this.#input[i] *= before + ((i + 1) / BLOCK) * (target - before);
+    const { length } = this.#input;
+    for (let i = 0; i < length; i++) this.#input[i] *= before + ((i + 1) / length) * (target - before);
     this.#amplitude = target;
     this.#direct.process(this.#input, channels);
     return this.#convolver.process(this.#input, channels);
@@ -86,6 +89,7 @@ export class LocalStream {
   #tell;
   #now;
   #sampleRate;
+  #block; // samples of a block
   #shape = null; // of responses, once the field is there
   #level = null; // its name, likewise
   #listener;
@@ -101,7 +105,7 @@ export class LocalStream {
   #startedAt = 0;
   #rendered = 0; // blocks, since startedAt
   #inTime = 0; // of those that were rehearsed last
-  #unheard = Array.from({ length: CHANNELS }, () => new Float32Array(BLOCK));
+  #unheard; // what a block of silence is rendered to, or one that fades out
   #sequence = 0;
   #late = 0;
   #dropped = 0;
@@ -117,10 +121,16 @@ export class LocalStream {
     this.#tell = tell;
     this.#now = now;
     this.#sampleRate = hello.sampleRate;
+    this.#block = blockSizeAt(hello.sampleRate);
+    this.#unheard = this.#newChannels();
     this.#listener = listener;
     for (const emitter of emitters) this.#wanted.set(emitter.id, emitter);
     listeners.state({ state: "connecting", attempt: 0 });
-    tell({ type: "open", server, key, scene: hello.scene, level: hello.level, sampleRate: hello.sampleRate, block: BLOCK });
+    tell({ type: "open", server, key, scene: hello.scene, level: hello.level, sampleRate: hello.sampleRate, block: this.#block });
+  }
+
+  #newChannels() {
+    return Array.from({ length: CHANNELS }, () => new Float32Array(this.#block));
   }
 
   /** Takes a message of field_worker.js. */
@@ -140,7 +150,7 @@ export class LocalStream {
 
   #opened({ level, ms, ...shape }) {
     this.#costs.push(ms);
-    this.#shape = { ...shape, sampleRate: this.#sampleRate };
+    this.#shape = { ...shape, sampleRate: this.#sampleRate, block: this.#block };
     this.#level = level;
     this.#openedAt = this.#startedAt = this.#now();
     this.setListener({ ...this.#listener, at: this.#now() });
@@ -162,18 +172,18 @@ export class LocalStream {
   #begin() {
     this.#isHeard = true;
     const welcome = {
-      type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: BLOCK, channels: CHANNELS, encoding: "f32",
+      type: "welcome", session: "local", sample_rate: this.#sampleRate, block_size: this.#block, channels: CHANNELS, encoding: "f32",
       level: this.#level, order: 1, max_emitters: MOST_EMITTERS,
     };
     this.#listeners.state({ state: "live", welcome });
     this.setListener({ ...this.#listener, at: this.#now() });
-    for (let lead = Math.ceil((LEAD_S * this.#sampleRate) / BLOCK); lead > 0; lead--) this.#listeners.block(this.#render(false));
+    for (let lead = Math.ceil((LEAD_S * this.#sampleRate) / this.#block); lead > 0; lead--) this.#listeners.block(this.#render(false));
     this.#startedAt = this.#toldAt = this.#now();
     this.#rendered = 1; // the last of them is the one that is due now
   }
 
   #dueAt(now) {
-    return Math.floor((((now - this.#startedAt) / 1000) * this.#sampleRate) / BLOCK) + 1;
+    return Math.floor((((now - this.#startedAt) / 1000) * this.#sampleRate) / this.#block) + 1;
   }
 
   #failed({ code, message, needsKey }) {
@@ -280,7 +290,7 @@ export class LocalStream {
       return;
     }
     const due = this.#dueAt(now);
-    const most = Math.ceil((BEHIND_S * this.#sampleRate) / BLOCK);
+    const most = Math.ceil((BEHIND_S * this.#sampleRate) / this.#block);
     if (due - this.#rendered > most) {
       this.#dropped += due - this.#rendered - 1;
       this.#rendered = due - 1;
@@ -301,7 +311,7 @@ export class LocalStream {
   }
 
   #render(late) {
-    const channels = Array.from({ length: CHANNELS }, () => new Float32Array(BLOCK));
+    const channels = this.#newChannels();
     const poses = { poseId: this.#heard("hasPath"), reverberationPoseId: this.#heard("hasResponse") };
     for (const emitter of this.#emitters.values()) this.#giveBack(emitter.process(channels));
     for (const emitter of this.#leaving) {
@@ -312,10 +322,10 @@ export class LocalStream {
     for (const emitter of this.#fading.splice(0)) {
       for (const channel of this.#unheard) channel.fill(0);
       this.#giveBack(emitter.process(this.#unheard));
-      channels.forEach((samples, k) => samples.forEach((_, i) => (samples[i] += (1 - (i + 1) / BLOCK) * this.#unheard[k][i])));
+      channels.forEach((samples, k) => samples.forEach((_, i) => (samples[i] += (1 - (i + 1) / this.#block) * this.#unheard[k][i])));
     }
     const sequence = this.#sequence++;
-    return { ...poses, channels, sequence, sampleClock: sequence * BLOCK, frames: BLOCK, flags: 0, late };
+    return { ...poses, channels, sequence, sampleClock: sequence * this.#block, frames: this.#block, flags: 0, late };
   }
 
   /** The newest pose with which everything is heard. */

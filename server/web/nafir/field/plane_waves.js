@@ -87,7 +87,8 @@ function bandCepstra(sampleRate, taps) {
   return cepstra;
 }
 
-function besselI0(x) {
+/** The modified Bessel function of order 0. */
+export function besselI0(x) {
   let [term, sum] = [1, 1];
   for (let n = 1; term > 1e-17 * sum; n++) {
     term *= (x / (2 * n)) ** 2;
@@ -96,18 +97,19 @@ function besselI0(x) {
   return sum;
 }
 
-/** [phase][tap] windowed sincs that read a signal between its samples; one phase more than PHASES, to interpolate to. */
-export function sincTable() {
-  return Array.from({ length: PHASES + 1 }, (_, phase) => {
-    const row = Array.from({ length: SINC_TAPS }, (_, tap) => {
-      const offset = tap - BEFORE - phase / PHASES;
-      const sinc = offset === 0 ? 1 : Math.sin(Math.PI * offset) / (Math.PI * offset);
-      return sinc * besselI0(KAISER_BETA * Math.sqrt(Math.max(0, 1 - (offset / (SINC_TAPS / 2)) ** 2)));
-    });
-    const sum = row.reduce((total, value) => total + value, 0);
-    return row.map((value) => value / sum);
+/** [tap] a sinc in a Kaiser window that reads a signal at a fraction of a sample after tap `taps / 2 - 1`. */
+export function windowedSinc(fraction, taps, beta) {
+  const row = Float64Array.from({ length: taps }, (_, tap) => {
+    const offset = tap - (taps / 2 - 1) - fraction;
+    const sinc = offset === 0 ? 1 : Math.sin(Math.PI * offset) / (Math.PI * offset);
+    return sinc * besselI0(beta * Math.sqrt(Math.max(0, 1 - (offset / (taps / 2)) ** 2)));
   });
+  const sum = row.reduce((total, value) => total + value, 0);
+  return row.map((value) => value / sum);
 }
+
+/** [phase][tap] windowed sincs that read a signal between its samples; one phase more than PHASES, to interpolate to. */
+export const sincTable = () => Array.from({ length: PHASES + 1 }, (_, phase) => windowedSinc(phase / PHASES, SINC_TAPS, KAISER_BETA));
 
 export class PlaneWaves {
   #sampleRate;
