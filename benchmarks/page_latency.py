@@ -27,6 +27,7 @@ _WAYS = {
     "ambisonics of order 1 by the server, turned in the browser": {"level": "auto", "turning": "browser"},
     "all in the browser": {"level": "in-this-browser", "turning": "browser"},
 }
+_RATE = 48_000
 _SETTLE_S = 40
 """The buffer begins with what any connection bears, and shrinks while nothing is late."""
 _MEASURE_S = 30
@@ -105,7 +106,7 @@ def main(note: str) -> None:
         options = ["--no-sandbox", "--autoplay-policy=no-user-gesture-required"]
         browser = playwright.chromium.launch(executable_path=chromium, args=options)
         page = browser.new_page(viewport={"width": 1280, "height": 900})
-        page.goto(url)
+        page.goto(f"{url}/?rate={_RATE}")
         page.evaluate("nafir.ready")
         page.get_by_role("button", name="Play").click()
         page.wait_for_function("nafir.state().connection === 'live'")
@@ -122,7 +123,8 @@ def main(note: str) -> None:
         commit=commit.stdout.strip(),
         command="`python -m benchmarks.page_latency`",
         facts={
-            "Measured": f"medians over {_MEASURE_S} s, {_SETTLE_S} s after each began; Chromium is on the same machine"
+            "Measured": f"medians over {_MEASURE_S} s, {_SETTLE_S} s after each began; Chromium is on the same machine",
+            "Sample rate": f"{_RATE} Hz",
         },
         tables={"ways": Table(columns=columns, rows=tuple(rows))},
     )

@@ -1,8 +1,8 @@
 // window.nafir: an interface to the page for tests and for the browser's console.
 //
 //   await nafir.ready                         the scene is on the page and play can be pressed
-//   nafir.state()                             {connection, playing, output, level, head, effects, listener, emitters, doors, latency,
-//                                              reverberationLatency, turnLatency, poses}
+//   nafir.state()                             {connection, playing, sampleRate, output, level, head, effects, listener, emitters, doors,
+//                                              latency, reverberationLatency, turnLatency, poses}
 //   await nafir.setListener({x, y, z, yaw})   metres and radians, each optional; resolves when it is heard (at once while paused)
 //   await nafir.setEmitter("A", {x, y, z})    likewise
 //   await nafir.capture(seconds)              {sampleRate, left, right}: the last seconds played (12 at most), before the volume
@@ -35,6 +35,7 @@ export function exposeHook(page) {
     state: () => ({
       connection: page.connection,
       playing: page.playing,
+      sampleRate: page.player.sampleRate,
       output: page.output,
       level: page.level,
       head: page.head,

@@ -19,7 +19,7 @@ import { onThemeChange } from "./palette.js";
 import { Panel } from "./panel.js";
 import { Paper } from "./paper.js";
 import { PhoneTurning } from "./phone.js";
-import { Player } from "./player.js";
+import { Player, rateFor } from "./player.js";
 import { fetchClips, fetchDecoder, fetchFrontier, fetchHeads, fetchLoudness, fetchScene, fetchScenes, fetchSection, streamUrl } from "./scenes.js";
 import { linkTo, readSituation } from "./situation.js";
 import { Sources } from "./sources.js";
@@ -32,6 +32,7 @@ const DRY = { early_reflections: false, late_reverberation: false };
 const AS_PLANNED = { early_reflections: null, late_reverberation: null };
 const ORDER = 1; // of ambisonic streams
 const NO_FIELD = "none";
+const LIKELY_HZ = 48_000; // of a sound card, until it is known
 const SETTLED_MS = 300; // a choice is made for so long before another stream begins: keys pass through levels on their way
 const SLOW_MS = 1000; // after which the page says that a level is being prepared
 const GOES_ON = "What you hear goes on until it is there.";
@@ -64,7 +65,8 @@ class Page {
     this.output = null; // of the present stream; null while there is none
     this.rendered = null; // the server's plan of effects; null while there is no stream
     this.level = this.head = null; // the present level and head; null while there is no stream
-    this.decoded = null; // the head whose filters the worklet has
+    this.decoded = this.decodedHz = null; // the head whose filters the worklet has, and their rate
+    this.rate = undefined; // the sample rate that the link of the page asks for
     this.player = new Player();
     this.own = new OwnSounds();
     this.ledger = new PoseLedger();
@@ -155,7 +157,12 @@ class Page {
     choice.replaceChildren(...scenes.map(({ id, name }) => new Option(name, id, false, id === chosen.id)));
     choice.hidden = false;
     find("scene-name").hidden = true;
-    choice.onchange = () => location.assign(`?scene=${encodeURIComponent(choice.value)}`);
+    choice.onchange = () => {
+      const link = new URL(location.href);
+      link.searchParams.set("scene", choice.value);
+      link.hash = "";
+      location.assign(link);
+    };
   }
 
   #describe(scene) {
@@ -169,6 +176,7 @@ class Page {
 
   #setUp(scene, { clips, mostEmitters }) {
     this.scene = scene;
+    this.#chooseRate(new URLSearchParams(location.search).get("rate"));
     this.clips = clips;
     this.world = new World(scene, { mostEmitters });
     this.turning.directionalLevels = scene.directional_levels ?? [];
@@ -192,6 +200,14 @@ class Page {
     this.map();
     find("play").disabled = false;
     document.body.classList.add("ready");
+  }
+
+  /** Takes the rate that the link of the page asks for; without one it is that of the sound card. */
+  #chooseRate(wanted) {
+    if (wanted === null) return;
+    const offered = this.scene.sample_rates ?? [this.scene.sample_rate];
+    if (offered.includes(Number(wanted))) this.rate = Number(wanted);
+    else this.notices.show("rate", `The scene is not played at a rate of “${wanted}”, but at ${offered.join(", ")} Hz.`);
   }
 
   #listenToWorld() {
@@ -447,7 +463,7 @@ class Page {
     const output = isTurnedHere ? "ambisonics" : this.effects.wishes.output;
     const hello = {
       scene: this.scene.id,
-      sampleRate: this.scene.sample_rate,
+      sampleRate: this.player.sampleRate,
       level: isHere ? undefined : this.frontier.chosen,
       effects: this.effects.wishes.effects,
       doors: isHere ? undefined : this.world.openness,
@@ -561,6 +577,7 @@ class Page {
     const level = this.frontier.chosen;
     const link = linkTo(location.href, {
       scene: this.scene.id,
+      rate: this.rate,
       listener: this.world.listener,
       sources: [...this.world.emitters.values()].filter(({ clip }) => !isOwn(clip)),
       level: level === "auto" ? undefined : level,
@@ -625,11 +642,13 @@ class Page {
   async #listenWithHead() {
     try {
       const head = this.heads.chosen ?? (await fetchHeads()).default;
-      if (head !== this.decoded) {
-        const decoder = await fetchDecoder(head, { order: ORDER, sampleRate: this.scene.sample_rate });
+      const sampleRate = this.player.sampleRate ?? this.rate ?? rateFor(LIKELY_HZ, this.scene);
+      if (head !== this.decoded || sampleRate !== this.decodedHz) {
+        const decoder = await fetchDecoder(head, { order: ORDER, sampleRate });
         if ((this.heads.chosen ?? head) !== head) return; // another was chosen meanwhile
+        if ((this.player.sampleRate ?? sampleRate) !== sampleRate) return; // the sound card has another
         this.player.listenWith({ filters: decoder.filters, delaySamples: decoder.delay_samples });
-        this.decoded = head;
+        [this.decoded, this.decodedHz] = [head, sampleRate];
       }
       if (this.output === "ambisonics") this.head = head;
     } catch (error) {
@@ -651,7 +670,7 @@ class Page {
     this.#setConnection("connecting", "Connecting");
     let port;
     try {
-      port = await this.player.start(this.scene.sample_rate);
+      port = await this.player.start((cardHz) => this.rate ?? rateFor(cardHz, this.scene));
     } catch (error) {
       this.#setPlaying(false);
       this.#setConnection("refused", "No sound");

@@ -5,12 +5,12 @@ import { microphone } from "./nafir/microphone.js";
 
 const MOST_BYTES = 64 * 2 ** 20;
 const MOST_S = 600;
-const DECODED_HZ = 48_000; // a file is played at the rate of the stream, whatever this is
+const USUAL_HZ = 48_000; // at which a file is decoded at first; where it is played at another rate, it is decoded for that
 const MICROPHONE = "own:microphone";
 const REASONS = {
   NotAllowedError: "The browser may not use the microphone.",
   NotFoundError: "There is no microphone.",
-  NotSupportedError: "This browser cannot use the microphone at the sample rate of the scene.",
+  NotSupportedError: "This browser cannot use the microphone at the sample rate of the stream.",
 };
 
 export const isOwn = (name) => name.startsWith("own:");
@@ -48,9 +48,10 @@ export class OwnSounds extends EventTarget {
       this.#refuse(`${file.name} has more than ${MOST_BYTES / 2 ** 20} MB.`);
       return;
     }
+    const decodedAt = async (rate) => new OfflineAudioContext(1, 1, rate).decodeAudioData(await file.arrayBuffer());
     let buffer;
     try {
-      buffer = await new OfflineAudioContext(1, 1, DECODED_HZ).decodeAudioData(await file.arrayBuffer());
+      buffer = await decodedAt(USUAL_HZ);
     } catch {
       this.#refuse(`${file.name} is no sound that this browser can read.`);
       return;
@@ -59,7 +60,9 @@ export class OwnSounds extends EventTarget {
       this.#refuse(`${file.name} is longer than ${MOST_S / 60} minutes.`);
       return;
     }
-    const make = (context) => {
+    const make = async (context) => {
+      // A buffer of another rate would be played by linear interpolation.
+      if (buffer.sampleRate !== context.sampleRate) buffer = await decodedAt(context.sampleRate);
       const node = new AudioBufferSourceNode(context, { buffer, loop: true });
       node.start();
       return node;

@@ -1,9 +1,26 @@
-// Audio output of the page: an AudioContext at the stream's sample rate, the output of the stream and a volume control.
+// Audio output of the page: an AudioContext, whose sample rate is that of streams, the output of the stream and a volume control.
 // Events: those of the output, and "interrupted" when the system stops the sound (a call, another tab).
 
 import { Output } from "./nafir/output.js";
 
 const OUTPUT_EVENTS = ["report", "heard", "turned"];
+const USUAL_HZ = 48_000; // has all that is audible
+
+/** The rate at which a scene ({sample_rate, sample_rates}) is played through a sound card: the card's own if streams have it, else another. */
+export function rateFor(cardHz, { sample_rate: ownHz, sample_rates: offeredHz = [ownHz] }) {
+  if (offeredHz.includes(cardHz) && cardHz <= USUAL_HZ) return cardHz;
+  return offeredHz.includes(USUAL_HZ) ? USUAL_HZ : ownHz;
+}
+
+/** An AudioContext of the rate that `choose` gives for that of the sound card. */
+function openContext(choose) {
+  const latencyHint = "interactive";
+  const context = new AudioContext({ latencyHint });
+  const sampleRate = choose(context.sampleRate);
+  if (sampleRate === context.sampleRate) return context;
+  context.close();
+  return new AudioContext({ latencyHint, sampleRate });
+}
 
 export class Player extends EventTarget {
   #context = null;
@@ -16,10 +33,11 @@ export class Player extends EventTarget {
   #turn = null; // and how it will be turned
   #wanted = false; // whether sound should be running, so that a pause followed by a start does nothing
 
-  /** Starts audio. Browsers allow that only in a user gesture. Resolves with a port that takes audio blocks. */
-  async start(sampleRate) {
+  /** Starts audio, the first time at the rate that `choose` gives for that of the sound card. Browsers allow that only in a user gesture.
+      Resolves with a port that takes audio blocks. */
+  async start(choose) {
     if (!this.#context) {
-      this.#context = new AudioContext({ sampleRate, latencyHint: "interactive" });
+      this.#context = openContext(choose);
       this.#ready = this.#build();
     }
     this.#wanted = true;
@@ -65,6 +83,11 @@ export class Player extends EventTarget {
   /** The AudioContext; null before the first start. */
   get context() {
     return this.#context;
+  }
+
+  /** Of the AudioContext, in Hz; null before the first start. */
+  get sampleRate() {
+    return this.#context?.sampleRate ?? null;
   }
 
   /** What takes the sound of a live emitter; see Output. */

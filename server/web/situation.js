@@ -1,4 +1,5 @@
-// A situation as a link: the scene in the query, and after the # who stands where, what plays and how it is heard.
+// A situation as a link: in the query the scene, and the sample rate if it was chosen; after the # who stands where, what plays and how it is
+// heard.
 //
 //   ?scene=house#doors=living:0.5,bath:1&listener=…
 //   ?scene=apartment#listener=2.2,2,1.6,45&source=guitar,6,3,1.5,-3&source=claps,1,1,1.5&level=…&output=mono&head=kemar&turning=server&effects=hrtf:off
@@ -12,7 +13,7 @@ const rounded = (value) => +value.toFixed(DIGITS);
 const degrees = (radians) => (radians * 180) / Math.PI;
 
 /** The link to a situation, on the page at `href`. What the situation does not have is left to the page. */
-export function linkTo(href, { scene, listener, sources, level, output, head, turning, effects, doors }) {
+export function linkTo(href, { scene, rate, listener, sources, level, output, head, turning, effects, doors }) {
   const said = new URLSearchParams();
   said.append("listener", [...listener.position.map(rounded), rounded(degrees(listener.yaw))].join());
   for (const { clip, position, gainDb } of sources) {
@@ -26,7 +27,7 @@ export function linkTo(href, { scene, listener, sources, level, output, head, tu
   const moved = Object.entries(doors ?? {}).map(([name, openness]) => `${encodeURIComponent(name)}:${rounded(openness)}`);
   if (moved.length > 0) said.append("doors", moved.join());
   const link = new URL(href);
-  link.search = new URLSearchParams({ scene });
+  link.search = new URLSearchParams(rate === undefined ? { scene } : { scene, rate });
   // Commas and colons may stand in a fragment, and are easier to read than what they are escaped to.
   link.hash = said.toString().replaceAll("%2C", ",").replaceAll("%3A", ":");
   return link.href;
