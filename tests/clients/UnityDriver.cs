@@ -74,7 +74,7 @@ static class UnityDriver
                     return "refused";
                 }
             case "play": return Play(words.Select(each => (double)Number(each)).ToArray());
-            case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]));
+            case "hear": return Hear(words[0], words[1], words[2], Number(words[3]), words[4], Number(words[5]), words.Length > 6 ? words[6] : null);
             case "cameras": return Cameras(words[0], words[1], words[2]);
             case "listeners": return Listeners(words[0], words[1], words[2]);
             case "doors": return Doors(words[0], words[1]);
@@ -163,8 +163,10 @@ static class UnityDriver
 
     // Plays a stream as a sound card would, for some seconds, and writes what is heard (float32, stereo, 48 kHz) to a file. Says meanwhile
     // what becomes of it, a line for each event, and how many samples had been heard by then. While
-    // the connection is lost, it adds an emitter.
-    static string Hear(string url, string scene, string clip, double seconds, string path, double giveUpAfterS)
+    // the connection is lost, it adds an emitter. If there is a `shot`, a clip, it is played once by three emitters as soon as there is a
+    // snapshot, and the other clip is next to silent: `over` and `stays` play its end, and the first of them is removed then; `heard` plays
+    // all of it.
+    static string Hear(string url, string scene, string clip, double seconds, string path, double giveUpAfterS, string shot)
     {
         const int Quantum = 480;
         var pose = NafirPose.FromUnity(new NafirVector(2, 1.5f, 2.5f), new NafirQuaternion(0, 0.70710678f, 0, 0.70710678f));
@@ -178,7 +180,17 @@ static class UnityDriver
                 Console.WriteLine($"state {state} {Volatile.Read(ref played)} {stream.Problem}");
                 if (state == NafirState.Waiting) stream.SetEmitter("late", new NafirSource { Clip = clip, Pose = pose, GainDb = -70 });
             };
-            stream.Received += message => Say(message);
+            stream.Received += message =>
+            {
+                Say(message);
+                if (shot == null || (string)message["type"] != "snapshot") return;
+                stream.SetEmitter("over", new NafirSource { Clip = shot, Pose = pose, Loop = false, OffsetS = 5, RemoveWhenEnded = true });
+                stream.SetEmitter("stays", new NafirSource { Clip = shot, Pose = pose, Loop = false, OffsetS = 5 });
+                stream.SetEmitter("heard", new NafirSource { Clip = shot, Pose = pose, Loop = false });
+                shot = null;
+            };
+            stream.EmitterEnded += id => Console.WriteLine($"ended {id}");
+            if (shot != null) source.GainDb = -70;
             stream.SetEmitter("source", source);
             var ears = new float[2 * Quantum];
             double fullest = 0;

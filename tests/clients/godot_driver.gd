@@ -42,7 +42,7 @@ func _initialize():
 	var vectors = JSON.parse(file.get_as_text()).result
 	var is_right = (
 		_poses(core, vectors.poses) and _listener(core, vectors.listener) and _dry(core, vectors.dry_blocks)
-		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _doors(core) and _guests(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
+		and _blocks(core, vectors.audio_blocks) and _texts(core) and _resuming(core) and _doors(core) and _guests(core) and _one_shots(core) and _resampling(core) and _playing(core, 24036) and _playing(core, 23964)
 	)
 	print("checked %d" % _checked)
 	quit(0 if is_right else 1)
@@ -242,6 +242,67 @@ func _guests(core):
 	return true
 
 
+# Clips that play once, over the loss of their server. Prints what is said and told in each step, a line each, as tests/clients/one_shots.py has
+# it.
+func _one_shots(core):
+	var stream = core.new()
+	stream.connect("emitter_ended", self, "_on_emitter_ended")
+	var pose = core.make_pose(Vector3(), Quat(0, 0, 0, 1))
+	var welcome = {"type": "welcome", "sample_rate": 24000.0, "level": "standard", "resume_token": "t"}
+	stream.begin()
+	stream.receive(welcome)
+	stream.set_emitter("loop", "trumpet", pose, 0.0)
+	stream.set_emitter("again", "trumpet", pose, 0.0, {"loop": false})
+	_receive_added(stream, "loop", 0.0)
+	stream.receive({"type": "snapshot", "snapshot": "sealed", "pose_id": 0.0, "handled": 2.0, "expires_s": 120.0})
+	for id in ["over", "stays", "heard", "waiting"]:
+		stream.set_emitter(id, "trumpet", pose, 0.0, {"loop": false, "remove_when_ended": id == "over"})
+	stream.set_emitter("later", "trumpet", pose, 0.0, {"loop": false, "start_at": 1000000})
+	for id in ["again", "over", "stays", "heard"]:
+		_receive_added(stream, id, 0.0)
+	_receive_added(stream, "later", 1000000.0)
+	stream.set_gain("heard", -3.0)
+	_receive_ended(stream, "over", true)
+	_receive_ended(stream, "stays", false)
+	_hear(stream, 0, 0)
+	_tell(stream, "shots")
+	stream.lost("a cut")
+	stream.begin()
+	var resumed = welcome.duplicate()
+	resumed["resumed"] = {"handled": 2.0, "sample_clock": 5000.0, "pose_id": 0.0}
+	stream.receive(resumed)
+	_tell(stream, "shots")
+	_receive_added(stream, "again", 5120.0)
+	_tell(stream, "shots")
+	for id in ["again", "over", "heard"]:
+		_receive_ended(stream, id, true)
+	_tell(stream, "shots")
+	stream.lost("another")
+	stream.begin()
+	resumed["resumed"] = {"handled": 4.0, "sample_clock": 5376.0, "pose_id": 0.0}
+	stream.receive(resumed)
+	_tell(stream, "shots")
+	_receive_added(stream, "waiting", 6000.0)
+	_hear(stream, 0, 24)
+	stream.lost("a third")
+	stream.begin()
+	stream.receive(welcome)
+	_tell(stream, "shots")
+	return true
+
+
+func _receive_added(stream, id, clock):
+	stream.receive({"type": "emitter_added", "id": id, "sample_clock": clock})
+
+
+func _receive_ended(stream, id, removed):
+	stream.receive({"type": "emitter_ended", "id": id, "sample_clock": 0.0, "removed": removed})
+
+
+func _on_emitter_ended(id):
+	_told.append("ended:" + id)
+
+
 func _on_listener_added(id):
 	_told.append("added:" + id)
 
@@ -263,7 +324,7 @@ func _hear(stream, number, sequence):
 	stream.receive_block(data)
 
 
-func _tell(stream):
+func _tell(stream, of = "guests"):
 	for each in stream.texts:
 		var id = each.get("id", each.get("listener"))
 		_told.append("%s:%s" % [each.type, id if id != null else ""])
@@ -275,7 +336,7 @@ func _tell(stream):
 	var line = ""
 	for each in _told:
 		line += each + " "
-	_print_guests(line)
+	print("%s %s" % [of, line])
 	_told.clear()
 
 

@@ -1,7 +1,8 @@
 # Plays a stream by client_examples/godot for test_engine_losses.py, and writes what a sound card would play (float32, stereo, 48 kHz) to a
-# file. Says meanwhile what becomes of it, and how many samples had been heard by then. While the connection is lost, it adds an emitter.
+# file. Says meanwhile what becomes of it, and how many samples had been heard by then. While the connection is lost, it adds an emitter. A SHOT
+# is as in UnityDriver.cs.
 #
-#   godot3-server --path client_examples/godot -s godot_losses.gd --url=URL --clip=CLIP --seconds=S --output=PATH --give-up-after=S
+#   godot3-server --path client_examples/godot -s godot_losses.gd --url=URL --clip=CLIP --seconds=S --output=PATH --give-up-after=S [--shot=SHOT]
 extends SceneTree
 
 const RATE = 48000
@@ -65,8 +66,13 @@ func _initialize():
 	_source.translation = Vector3(6, 1.5, -3)
 	get_root().add_child(_source)
 	get_root().add_child(_recorder)
-	_recorder.add_emitter("source", _source, _given.clip)
+	_recorder.connect("emitter_ended", self, "_on_emitter_ended")
+	_recorder.add_emitter("source", _source, _given.clip, -70.0 if _given.has("shot") else 0.0)
 	Engine.target_fps = 60
+
+
+func _on_emitter_ended(id):
+	print("ended %s" % id)
 
 
 func _on_state_changed(state):
@@ -82,6 +88,11 @@ func _on_state_changed(state):
 
 func _idle(_delta):
 	var core = _recorder.core
+	if _given.has("shot") and core._snapshot != "":
+		_recorder.add_emitter("over", _recorder, _given.shot, 0.0, {"loop": false, "offset_s": 5, "remove_when_ended": true})
+		_recorder.add_emitter("stays", _recorder, _given.shot, 0.0, {"loop": false, "offset_s": 5})
+		_recorder.add_emitter("heard", _recorder, _given.shot, 0.0, {"loop": false})
+		_given.erase("shot")
 	for id in core._emitters:
 		if core._emitters[id].start >= 0 and not _told.has(id):
 			_told[id] = true

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from server.protocol.client_messages import parse_client_message
-from tests.clients import guests
+from tests.clients import guests, one_shots
 from tests.clients.vectors import CLIENTS, readme_commands
 
 GODOT = shutil.which("godot3-server")
@@ -44,7 +44,8 @@ def test_poses_messages_and_playing_are_right_in_gdscript(tmp_path):
     assert (live.id, live.live) == ("mine", True)
     assert (gain.gain_db, move.pose.position, remove.id) == (-6, (1, -3, 2), "mine")
     assert (door.door, door.openness) == ("kitchen", 0.5)
-    guests.check([line.removeprefix("guests ") for line in done.stdout.splitlines() if line.startswith("guests ")])
+    for name, steps in (("guests ", guests), ("shots ", one_shots)):
+        steps.check([line.removeprefix(name) for line in done.stdout.splitlines() if line.startswith(name)])
 
 
 def command(address: str, *options: str) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from server.protocol.client_messages import Hello, MoveEmitter, parse_client_message
-from tests.clients import guests
+from tests.clients import guests, one_shots
 from tests.clients.vectors import CLIENTS, TABLE, assert_same_poses, poses, readme_commands
 
 COMPILER = shutil.which("g++")
@@ -159,6 +159,10 @@ def test_doors_stay_as_the_game_has_them_over_lost_connections(program):
 
 def test_listeners_stay_as_the_game_has_them_whatever_becomes_of_the_connection(program):
     guests.check(answers(program, "guests"))
+
+
+def test_what_plays_once_and_was_heard_is_not_begun_again_by_another_server(program):
+    one_shots.check(answers(program, "shots"))
 
 
 def test_the_component_is_of_the_engines_types():

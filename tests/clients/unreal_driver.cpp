@@ -156,6 +156,92 @@ void Doors() {
   tell();
 }
 
+// Prints, in the order of the alphabet, what a game was told, and what its session has to say.
+void Tell(nafir::Session& session, std::vector<std::string>& told) {
+  while (const auto message = session.Take()) {
+    const auto read = nafir::Json::Parse(message->data);
+    if (!message->is_text) {
+      told.push_back("pose:" + std::to_string(message->data[1]));
+    } else {
+      const std::string& id = (*read)["id"].Text();
+      told.push_back((*read)["type"].Text() + ":" + (id.empty() ? (*read)["listener"].Text() : id));
+    }
+  }
+  std::sort(told.begin(), told.end());
+  for (const std::string& each : told) std::cout << each << ' ';
+  std::cout << '\n';
+  told.clear();
+}
+
+// A silent block of 256 frames of a listener, whose clock is 256 for each before it.
+void Hear(nafir::Session& session, std::uint8_t number, std::uint8_t sequence) {
+  std::vector<std::uint8_t> block(28 + 4 * 256);
+  block[0] = 1;
+  block[2] = 2;
+  block[3] = number;
+  block[4] = sequence;
+  block[9] = sequence;
+  block[25] = 1;
+  session.ReceiveBlock(block.data(), block.size());
+}
+
+// Connects, and is welcomed.
+void BeginStream(nafir::Session& session, const std::string& resumed) {
+  session.Begin();
+  session.Receive(R"({"type":"welcome","sample_rate":24000,"level":"standard","resume_token":"t")" + resumed + "}");
+}
+
+// Clips that play once, over the loss of their server. Answers with what is said and told in each step, a line each, as
+// tests/clients/one_shots.py has it.
+void OneShots() {
+  nafir::Session session({});
+  std::vector<std::string> told;
+  session.on_emitter_ended = [&](const std::string& id) { told.push_back("ended:" + id); };
+  const auto add = [&](const std::string& id, bool loop, std::optional<std::uint64_t> start_at = std::nullopt) {
+    nafir::Source source;
+    source.clip = "trumpet";
+    source.loop = loop;
+    source.start_at = start_at;
+    source.remove_when_ended = id == "over";
+    session.SetEmitter(id, source);
+  };
+  const auto added = [&](const std::string& id, int clock) {
+    session.Receive(R"({"type":"emitter_added","id":")" + id + R"(","sample_clock":)" + std::to_string(clock) + "}");
+  };
+  const auto ended = [&](const std::string& id, bool removed) {
+    session.Receive(R"({"type":"emitter_ended","id":")" + id + R"(","sample_clock":0,"removed":)" + (removed ? "true}" : "false}"));
+  };
+  BeginStream(session, "");
+  add("loop", true);
+  add("again", false);
+  added("loop", 0);
+  session.Receive(R"({"type":"snapshot","snapshot":"sealed","pose_id":0,"handled":2,"expires_s":120})");
+  for (const char* id : {"over", "stays", "heard", "waiting"}) add(id, false);
+  add("later", false, 1000000);
+  for (const char* id : {"again", "over", "stays", "heard"}) added(id, 0);
+  added("later", 1000000);
+  session.SetGain("heard", -3);
+  ended("over", true);
+  ended("stays", false);
+  Hear(session, 0, 0);
+  Tell(session, told);
+  session.Lost("a cut");
+  BeginStream(session, R"(,"resumed":{"handled":2,"sample_clock":5000,"pose_id":0})");
+  Tell(session, told);
+  added("again", 5120);
+  Tell(session, told);
+  for (const char* id : {"again", "over", "heard"}) ended(id, true);
+  Tell(session, told);
+  session.Lost("another");
+  BeginStream(session, R"(,"resumed":{"handled":4,"sample_clock":5376,"pose_id":0})");
+  Tell(session, told);
+  added("waiting", 6000);
+  Hear(session, 0, 24);
+  session.Lost("a third");
+  BeginStream(session, "");
+  Tell(session, told);
+}
+
 // A stream with other listeners, over everything that may become of them. Answers with what is said and told in each step, a line each, as
 // tests/clients/guests.py has it.
 void Guests() {
@@ -163,35 +249,9 @@ void Guests() {
   std::vector<std::string> told;
   session.on_listener_added = [&](const std::string& id) { told.push_back("added:" + id); };
   session.on_listener_refused = [&](const std::string& id, const std::string&) { told.push_back("refused:" + id); };
-  const auto tell = [&] {
-    while (const auto message = session.Take()) {
-      const auto read = nafir::Json::Parse(message->data);
-      if (!message->is_text) {
-        told.push_back("pose:" + std::to_string(message->data[1]));
-      } else {
-        const std::string& id = (*read)["id"].Text();
-        told.push_back((*read)["type"].Text() + ":" + (id.empty() ? (*read)["listener"].Text() : id));
-      }
-    }
-    std::sort(told.begin(), told.end());
-    for (const std::string& each : told) std::cout << each << ' ';
-    std::cout << '\n';
-    told.clear();
-  };
-  const auto hear = [&](std::uint8_t number, std::uint8_t sequence) {
-    std::vector<std::uint8_t> block(28 + 4 * 256);
-    block[0] = 1;
-    block[2] = 2;
-    block[3] = number;
-    block[4] = sequence;
-    block[9] = sequence;  // its clock: 256 for each
-    block[25] = 1;
-    session.ReceiveBlock(block.data(), block.size());
-  };
-  const auto begin = [&](const std::string& resumed) {
-    session.Begin();
-    session.Receive(R"({"type":"welcome","sample_rate":24000,"level":"standard","resume_token":"t")" + resumed + "}");
-  };
+  const auto tell = [&] { Tell(session, told); };
+  const auto hear = [&](std::uint8_t number, std::uint8_t sequence) { Hear(session, number, sequence); };
+  const auto begin = [&](const std::string& resumed) { BeginStream(session, resumed); };
   const auto refuse = [&](const std::string& code, const std::string& more) {
     session.Receive(R"({"type":"error","code":")" + code + R"(","message":"no")" + more + "}");
   };
@@ -311,6 +371,8 @@ int main() {
       Resume(in);
     } else if (command == "doors") {
       Doors();
+    } else if (command == "shots") {
+      OneShots();
     } else if (command == "guests") {
       Guests();
     }

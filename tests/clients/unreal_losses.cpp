@@ -1,7 +1,8 @@
 // Plays a stream by client_examples/unreal for test_engine_losses.py, and writes what a sound card would play (float32, stereo, 48 kHz) to a
-// file. Says meanwhile what becomes of it, and how many samples had been heard by then. While the connection is lost, it adds an emitter.
+// file. Says meanwhile what becomes of it, and how many samples had been heard by then. While the connection is lost, it adds an emitter. A SHOT
+// is as in UnityDriver.cs.
 //
-//   unreal_losses HOST PORT CLIP SECONDS OUTPUT GIVE_UP_AFTER_S
+//   unreal_losses HOST PORT CLIP SECONDS OUTPUT GIVE_UP_AFTER_S [SHOT]
 
 #include <algorithm>
 #include <chrono>
@@ -13,11 +14,12 @@
 
 #include "PosixStream.h"
 
-int main(int, char** words) {
+int main(int count, char** words) {
   constexpr double kRate = 48000;
   constexpr std::size_t kFrames = 480;
   const std::string clip = words[3];
   const double seconds = std::atof(words[4]);
+  std::string shot = count > 7 ? words[7] : "";
   nafir::SessionOptions options;
   options.scene = "flat";
   options.sample_rate = static_cast<int>(kRate);
@@ -41,6 +43,11 @@ int main(int, char** words) {
     std::printf("emitter_added %s\n", id.c_str());
     std::fflush(stdout);
   };
+  session.on_emitter_ended = [](const std::string& id) {
+    std::printf("ended %s\n", id.c_str());
+    std::fflush(stdout);
+  };
+  if (!shot.empty()) source.gain_db = -70;
   session.SetListener(nafir::FromUnreal({200, -250, 150}, {}));
   session.SetEmitter("source", source);
   PosixStream stream(session, words[1], words[2], "");
@@ -52,6 +59,18 @@ int main(int, char** words) {
   for (int quantum = 1; quantum * kFrames <= seconds * kRate && !is_over; ++quantum) {
     stream.ReceiveUntil(began + std::chrono::microseconds(static_cast<std::int64_t>(1e6 * quantum * kFrames / kRate)));
     stream.Step(kFrames / kRate);
+    if (!shot.empty() && session.FirstMessage().find("\"snapshot\":\"") != std::string::npos) {
+      nafir::Source once;
+      once.clip = shot;
+      once.pose.position = nafir::PositionFromUnreal({200, -250, 150});
+      once.loop = false;
+      session.SetEmitter("heard", once);
+      once.offset_s = 5;
+      session.SetEmitter("stays", once);
+      once.remove_when_ended = true;
+      session.SetEmitter("over", once);
+      shot.clear();
+    }
     session.Read(ears.data(), kFrames);
     std::fwrite(ears.data(), sizeof(float), ears.size(), file);
     played += static_cast<int>(kFrames);

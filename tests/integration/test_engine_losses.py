@@ -2,12 +2,13 @@
 
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.clients.test_godot import GODOT, QUIET, needs_godot
@@ -18,6 +19,7 @@ from tests.clients.vectors import CLIENTS
 from tests.integration import losing
 from tests.integration.losing import until
 from tests.integration.lossy_proxy import LossyProxy
+from tests.integration.snapshots import Snapshots
 from tests.integration.test_resuming import free_port, serving_until_drained
 
 unity = unity_program
@@ -25,7 +27,8 @@ unity = unity_program
 Player = Callable[..., AbstractContextManager[Iterator[str]]]
 """Plays a clip of a server for some seconds, writes what is heard to a file, and gives the lines that it says: `state
 STATE SAMPLE PROBLEM` with the samples heard by then, the messages of the server, and at the `end` what was counted.
-While its connection is lost it adds an emitter."""
+While its connection is lost it adds an emitter. It may be given a `shot`, a clip that three emitters play once as soon
+as there is a snapshot: `over` and `stays` its end, `heard` all of it."""
 
 
 @pytest.fixture(scope="module")
@@ -39,20 +42,26 @@ def unreal(tmp_path_factory) -> Path:
     return compiled(driver, tmp_path_factory.mktemp("unreal") / "losses")
 
 
-def unity_command(program: Path, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
-    return [MONO, program, "hear", url, "flat", losing.CLIP, str(seconds), output, str(give_up_after_s)]
+def unity_command(
+    program: Path, url: str, seconds: float, output: Path, give_up_after_s: float, shot: Sequence[str]
+) -> list[str | Path]:
+    return [MONO, program, "hear", url, "flat", losing.CLIP, str(seconds), output, str(give_up_after_s), *shot]
 
 
-def godot_command(program: str, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+def godot_command(
+    program: str, url: str, seconds: float, output: Path, give_up_after_s: float, shot: Sequence[str]
+) -> list[str | Path]:
     driver = CLIENTS.parent / "tests" / "clients" / "godot_losses.gd"
     given = {"url": url, "clip": losing.CLIP, "seconds": seconds, "output": output, "give-up-after": give_up_after_s}
-    options = [f"--{name}={value}" for name, value in given.items()]
+    options = [f"--{name}={value}" for name, value in given.items()] + [f"--shot={each}" for each in shot]
     return [program, "--path", CLIENTS / "godot", "-s", driver, *options]
 
 
-def unreal_command(program: Path, url: str, seconds: float, output: Path, give_up_after_s: float) -> list[str | Path]:
+def unreal_command(
+    program: Path, url: str, seconds: float, output: Path, give_up_after_s: float, shot: Sequence[str]
+) -> list[str | Path]:
     host, port = url.removeprefix("ws://").removesuffix("/v1/stream").split(":")
-    return [program, host, port, losing.CLIP, str(seconds), output, str(give_up_after_s)]
+    return [program, host, port, losing.CLIP, str(seconds), output, str(give_up_after_s), *shot]
 
 
 COMMANDS = {"unity": unity_command, "godot": godot_command, "unreal": unreal_command}
@@ -63,8 +72,10 @@ ENGINES = [pytest.param(name, marks=NEEDS[name]) for name in COMMANDS]
 
 def player_of(engine: str, program: Path | str) -> Player:
     @contextmanager
-    def play(address: str, seconds: float, output: Path, *, give_up_after_s: float = 60.0) -> Iterator[Iterator[str]]:
-        command = COMMANDS[engine](program, f"ws://{address}/v1/stream", seconds, output, give_up_after_s)
+    def play(
+        address: str, seconds: float, output: Path, *, give_up_after_s: float = 60.0, shot: Sequence[str] = ()
+    ) -> Iterator[Iterator[str]]:
+        command = COMMANDS[engine](program, f"ws://{address}/v1/stream", seconds, output, give_up_after_s, shot)
         with subprocess.Popen(command, env=QUIET, stdout=subprocess.PIPE, text=True) as process:
             try:
                 yield process.stdout
@@ -178,3 +189,40 @@ def test_a_stream_that_is_kept_nowhere_begins_anew_and_a_server_that_is_gone_is_
         assert "Lost" in until(lines, "state")
         _, state, reconnections, resumptions, *_ = until(lines, "end").split()
     assert (state, reconnections, resumptions) == ("Lost", "1", "0")
+
+
+SECRETS = {"goes on": "a secret of both servers", "begins anew": "a secret of another server"}
+"""Of the server that comes after the lost one, whose secret is the first: by what becomes of the stream there."""
+
+
+@pytest.mark.parametrize("stream", [pytest.param("goes on"), pytest.param("begins anew", marks=pytest.mark.long)])
+def test_a_clip_that_plays_once_and_was_heard_is_not_played_by_another_server(
+    player, stream, bundle, hrtfs, tmp_path, monkeypatch
+):
+    """The snapshot is older than the clip, as that of a server which dies."""
+    Snapshots(monkeypatch).keep_to(1)
+    told = []
+    with (
+        serving_until_drained(bundle, hrtfs, SECRETS["goes on"]) as (old, _),
+        serving_until_drained(bundle, hrtfs, SECRETS[stream]) as (new, _),
+        LossyProxy(old).running() as network,
+        player(network.address, 9, tmp_path / "heard", shot=["trumpet"]) as lines,
+    ):
+        begun = {until(lines, "emitter_added") for _ in range(4)}
+        assert begun == {f"emitter_added {name}" for name in ("source", "over", "stays", "heard")}
+        assert {until(lines, "ended") for _ in range(2)} == {"ended over", "ended stays"}
+        network.redirect(new)
+        network.cut()
+        assert "Waiting" in until(lines, "state")
+        for line in lines:
+            told.append(line.strip())
+            if line.startswith("end "):
+                break
+    [(_, _, sample, *_)] = [line.split() for line in told if line.startswith("state Live")]
+    *_, (_, state, reconnections, resumptions, *_) = [line.split() for line in told]
+    assert (state, reconnections, resumptions) == ("Live", "1", "1" if stream == "goes on" else "0")
+    assert [line for line in told if line.startswith("ended")] == ["ended heard"]
+    # The source itself is there again, and next to silent.
+    heard = np.abs(losing.read(tmp_path / "heard"))
+    assert heard[int(sample) + losing.RATE :].max() < 0.01 * heard[: int(sample)].max()
+    assert heard[int(sample) + losing.RATE :].max() > 0

@@ -111,6 +111,23 @@ def test_the_end_is_told_once_when_all_is_silent_and_the_emitter_stays(session, 
     assert told == [ended], "it cannot end twice"
 
 
+@pytest.mark.parametrize("had_ended", [False, True])
+def test_a_clip_that_is_over_when_its_stream_goes_on_from_a_snapshot_is_silent(session, field, filters, had_ended):
+    add(session, loop=False)
+    answer(session, field)
+    hear(session, RUNG_OUT if had_ended else 3)
+    snapshot = session.snapshot(session="s", handled=1)
+    again = open_session(field, filters)
+    assert again.restore(snapshot) == []
+    again.continue_at(snapshot.sample_clock + RUNG_OUT * 256, RUNG_OUT)
+    told = []
+    silent = [hear(again, 2, told)]
+    assert answer(again, field) == [], "the client knows that it was heard"
+    assert not np.concatenate([*silent, hear(again, RUNG_OUT, told)], axis=1).any()
+    assert [type(each) for each in told] == ([] if had_ended else [EmitterEnded])
+    assert again.emitter_count == 1
+
+
 def test_nothing_is_heard_after_an_end(session, field):
     add(session, loop=False)
     answer(session, field)

@@ -80,7 +80,9 @@ var _token = "" # with which, or
 var _snapshot = "" # with which, the stream is resumed
 var _last_block = null # the greatest {sequence, sample_clock} of all listeners' blocks in this stream of the server's
 var _clock_offset = 0 # what is added to the server's clock
-var _orders = [] # the newest messages that the server counts, and how many there were
+# The newest messages that the server counts: {message, number, is_over} and the id of the `emitter` that it is about, or null; and how many
+# there were.
+var _orders = []
 var _ordered = 0
 
 
@@ -130,7 +132,7 @@ func add_listener(id, pose, head = ""):
 	if not _others.has(id):
 		_others[id] = {
 			"pose": pose, "head": head, "ears": Ears.new(), "moved": true, "has_been": false,
-			"order": 0, # the number of the order that adds it
+			"added": null, # the order that adds it
 			"number": -1, # in the headers of its blocks; -1 until the server has it
 			"is_refused": false, "ask_again_s": 0.0,
 		}
@@ -167,8 +169,10 @@ func set_emitter(id, clip, pose, gain_db, options = {}):
 	remove_emitter(id)
 	_emitters[id] = {
 		"clip": clip, "gain_db": gain_db, "pose": pose, "options": options, "moved": false,
-		"number": 0, # of the order that adds it
+		"added": null, # the order that adds it
 		"is_stopped": false, "is_refused": false, "ask_again_s": 0.0,
+		"was_heard": false, # when a connection was lost
+		"has_ended": false, # and the game was told so
 		"dry": [], "taken": 0, # samples that wait, and how many of them are gone
 		"recent": [0.0, 0.0, 0.0, 0.0], "between": 0.0, # of samples at another rate, and where between the middle two the next one is
 		"sequence": 0, "start": -1, "sent": 0,
@@ -192,7 +196,7 @@ func play_once(clip, pose, gain_db = 0.0, start_at = -1):
 func set_gain(id, gain_db, ramp_s = 0.0):
 	if _emitters.has(id):
 		_emitters[id].gain_db = gain_db
-		_order({"type": "set_gain", "id": id, "gain_db": gain_db, "ramp_s": ramp_s})
+		_order({"type": "set_gain", "id": id, "gain_db": gain_db, "ramp_s": ramp_s}, id)
 
 
 # Opens a door of the scene so far, from 0, shut, to 1. Call it with each frame while a door swings.
@@ -218,13 +222,13 @@ func stop_emitter(id, stop_at = -1, fade_s = 0.01):
 	var message = {"type": "stop_emitter", "id": id, "fade_s": fade_s}
 	if stop_at >= 0:
 		message["stop_at"] = _server_clock(stop_at)
-	_order(message)
+	_order(message, id)
 
 
 func remove_emitter(id):
 	if _emitters.has(id):
 		_emitters.erase(id)
-		_order({"type": "remove_emitter", "id": id})
+		_order({"type": "remove_emitter", "id": id}, id)
 
 
 # Chooses a quality level, or "auto".
@@ -436,11 +440,35 @@ func receive(message):
 				emit_signal("listener_added", message["id"])
 		"emitter_added":
 			if _emitters.has(message["id"]):
-				_open(_emitters[message["id"]], int(message["sample_clock"]))
+				_added(message["id"], int(message["sample_clock"]))
 		"emitter_ended":
-			if message["removed"]:
-				_emitters.erase(message["id"])
-			emit_signal("emitter_ended", message["id"])
+			if _emitters.has(message["id"]):
+				_tell_ended(_end(message["id"], message["removed"]))
+
+
+func _added(id, clock):
+	if _is_over(_emitters[id]):
+		_order({"type": "remove_emitter", "id": id}, id) # the server goes by a snapshot from before it was heard, and begins it again
+		_tell_ended(_end(id, true))
+	else:
+		_open(_emitters[id], clock)
+
+
+# The clip of an emitter is over. The server does not have the emitter any more if it `is_gone`. Returns its id where the game is to be told, in
+# an array.
+func _end(id, is_gone):
+	var emitter = _emitters[id]
+	var news = [] if emitter.has_ended else [id]
+	emitter.has_ended = true
+	if is_gone:
+		_emitters.erase(id)
+		_end_orders(emitter.added)
+	return news
+
+
+func _tell_ended(ids):
+	for id in ids:
+		emit_signal("emitter_ended", id)
 
 
 func _refused(error):
@@ -462,8 +490,7 @@ func _refused(error):
 		emitter.ask_again_s = float(error["retry_after_s"]) if error.get("retry_after_s") != null else 0.0
 		emit_signal("emitter_refused", id, problem)
 	elif error["code"] == "unknown_emitter" and _plays_once(emitter):
-		_emitters.erase(id) # its end was said just before the connection was lost
-		emit_signal("emitter_ended", id)
+		_tell_ended(_end(id, true)) # its end was said just before the connection was lost
 
 
 # One who comes back with a new connection is asked for again when the server says; any other is forgotten. Returns whether it was.
@@ -531,12 +558,15 @@ func _welcome(message):
 		emit_signal("listener_added", id)
 
 
-# The server has the stream still: it gets what it has not handled, and where everything is now.
+# The server has the stream still, or goes by a snapshot of it: it gets what it has not handled, and where everything is now. What plays once
+# and was heard since the snapshot is not begun again.
 func _go_on(handled, clock, pose_id):
 	statistics.resumptions += 1
+	var ended = _end_what_is_over(handled)
 	_handled(handled)
+	_drop_orders()
 	for each in _orders:
-		texts.append(each)
+		texts.append(each.message)
 	for door in _doors_moved:
 		_order_door(door)
 	_doors_moved.clear()
@@ -544,9 +574,12 @@ func _go_on(handled, clock, pose_id):
 	for id in _emitters:
 		var emitter = _emitters[id]
 		emitter.moved = true
-		# What was added is there, and that it is heard may have been said just before the connection was lost.
-		if emitter.start >= 0 or emitter.number <= handled:
-			_open(emitter, clock)
+		if not _is_among(emitter, handled):
+			emitter.start = -1 # it is among what is sent again
+		# That it is heard may have been said just before the connection was lost.
+		elif (emitter.clip == null) if emitter.start >= 0 else not emitter.is_refused:
+			_open(emitter, int(max(clock, _server_clock(emitter.options.get("start_at", 0)))))
+	_tell_ended(ended)
 
 
 # Listeners that the server has go on. Those that it should have and has not are asked for again. Returns the ids of those that are news.
@@ -557,7 +590,7 @@ func _go_on_hearing(handled, there):
 	var entered = []
 	for id in _others:
 		var other = _others[id]
-		if other.order > handled:
+		if not _is_among(other, handled):
 			continue # it is among what is sent again
 		if numbers.has(id):
 			# That it is there may have been said just before the connection was lost.
@@ -570,8 +603,9 @@ func _go_on_hearing(handled, there):
 	return entered
 
 
-# The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
+# The stream is a new one of the server's, whose clock is at 0. What plays once and was heard is not begun again.
 func _begin_anew():
+	var ended = _end_what_is_over(0)
 	if ears.next_clock >= 0:
 		var away_s = max(0.0, _since_block_s - float(buffer_blocks * block_size) / sample_rate)
 		_clock_offset = sample_clock + int(away_s * sample_rate)
@@ -590,18 +624,39 @@ func _begin_anew():
 		_ask(id)
 	for id in _emitters.keys():
 		var emitter = _emitters[id]
-		if emitter.start >= 0 and _plays_once(emitter):
-			_emitters.erase(id)
-			emit_signal("emitter_ended", id)
-			continue
 		emitter.start = -1
+		emitter.was_heard = false
 		emitter.sequence = 0
 		emitter.moved = false
 		_add(id)
+	_tell_ended(ended)
+
+
+# A connection was lost, and the server of the next one lacks what was ordered after number `handled`. Emitters among that which play once, and
+# have ended or were heard, end here. Returns the ids of those of which the game is to be told.
+func _end_what_is_over(handled):
+	var ended = []
+	for id in _emitters.keys():
+		var emitter = _emitters[id]
+		if emitter.start >= 0 and emitter.start < ears.next_clock:
+			emitter.was_heard = true
+		if _is_over(emitter) and not _is_among(emitter, handled):
+			ended += _end(id, true)
+	return ended
 
 
 func _plays_once(emitter):
 	return emitter.clip != null and (emitter.is_stopped or not emitter.options.get("loop", true))
+
+
+# Whether a server that does not have the emitter is not to begin it again.
+func _is_over(emitter):
+	return emitter.has_ended or (emitter.was_heard and _plays_once(emitter))
+
+
+# Whether an emitter or a listener is there after so many orders.
+static func _is_among(what, handled):
+	return what.added == null or what.added.number <= handled
 
 
 # The server hears the emitter from a clock on, and has no samples of it yet.
@@ -729,8 +784,7 @@ func _add(id):
 		message["live"] = true
 	else:
 		message["clip"] = emitter.clip
-	_order(message)
-	emitter.number = _ordered
+	emitter.added = _order(message, id)
 
 
 func _ask(id):
@@ -739,8 +793,7 @@ func _ask(id):
 	var message = {"type": "add_listener", "id": id, "position": other.pose.position, "orientation": other.pose.orientation}
 	if other.head != "":
 		message["hrtf"] = other.head
-	_order(message)
-	other.order = _ordered
+	other.added = _order(message)
 
 
 func _server_clock(clock):
@@ -775,21 +828,46 @@ static func _same(a, b):
 
 
 # Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted when it does.
-func _order(message):
+# `emitter` is the id of the one that the message is about. Returns the order; null for what is not said.
+func _order(message, emitter = null):
 	if state != "live" and not _can_resume():
-		return
-	_orders.append(message)
+		return null
 	_ordered += 1
+	var order = {"message": message, "number": _ordered, "emitter": emitter, "is_over": false}
+	_orders.append(order)
 	if _orders.size() > MOST_ORDERS:
 		_orders.pop_front()
 	if state == "live":
 		texts.append(message)
+	return order
 
 
 # So many orders need not be sent again.
 func _handled(count):
 	while _orders.size() > 0 and _ordered - _orders.size() < count:
 		_orders.pop_front()
+
+
+# The emitter that an order has added is over and gone: if the order is kept still, neither it nor what was said of the emitter since is sent
+# again.
+func _end_orders(added):
+	if added == null or added.number <= _ordered - _orders.size():
+		return
+	for each in _orders:
+		if each.emitter == added.emitter and each.number >= added.number:
+			each.is_over = true
+
+
+# Lets go of orders that are over. The others have the numbers by which the server is going to count them.
+func _drop_orders():
+	var orders = []
+	_ordered -= _orders.size()
+	for each in _orders:
+		if not each.is_over:
+			_ordered += 1
+			each.number = _ordered
+			orders.append(each)
+	_orders = orders
 
 
 # Says what a lost connection makes idle.

@@ -6,6 +6,7 @@ using System.Collections.Concurrent;
 using System.Collections.Generic;
 using System.Diagnostics;
 using System.IO;
+using System.Linq;
 using System.Net.WebSockets;
 using System.Text;
 using System.Threading;
@@ -59,17 +60,25 @@ namespace Nafir
         {
             public NafirSource Source;
             public bool Moved, Stopped;
-            public long Number; // of the order that adds it
+            public NafirOrder Added; // what adds it
             public NafirPlayback Dry; // of a live one; from the reader of its samples to the stream's rate
             public uint Sequence;
             public bool Heard;
             public ulong StartClock; // of the server
+            public bool WasHeard; // when a connection was lost
+            public bool HasEnded; // and the game was told so
             public ulong SentFrames;
             public Stopwatch Refused; // since when
             public long AskAgainMs; // after that; 0 for never
 
-            /// <summary>Whether its clip has an end, so that a new stream does not begin it again.</summary>
+            /// <summary>Whether its clip has an end.</summary>
             public bool PlaysOnce => Source.Clip != null && (!Source.Loop || Stopped);
+
+            /// <summary>Whether a server that does not have it is not to begin it again.</summary>
+            public bool IsOver => HasEnded || PlaysOnce && WasHeard;
+
+            /// <summary>Whether it is there after so many orders.</summary>
+            public bool IsAmong(long handled) => Added == null || Added.Number <= handled;
         }
 
         sealed class Other
@@ -78,7 +87,7 @@ namespace Nafir
             public NafirPose Pose;
             public string Head;
             public bool Moved, HasBeen;
-            public long Order; // the number of the order that adds it
+            public NafirOrder Added; // what adds it
             public int Number = -1; // in the headers of its blocks; -1 until the server has it
             public Stopwatch Refused; // since when
             public long AskAgainMs; // after that
@@ -209,12 +218,12 @@ namespace Nafir
                 var isKnown = emitters.TryGetValue(id, out var emitter);
                 if (isKnown && emitter.Source.Clip == source.Clip)
                 {
-                    if (emitter.Source.GainDb != source.GainDb) Order(NafirWire.SetGain(id, source.GainDb));
+                    if (emitter.Source.GainDb != source.GainDb) Order(NafirWire.SetGain(id, source.GainDb), id);
                     emitter.Source = source;
                     emitter.Moved = true;
                     return;
                 }
-                if (isKnown) Order(NafirWire.RemoveEmitter(id));
+                if (isKnown) Order(NafirWire.RemoveEmitter(id), id);
                 emitters[id] = emitter = new Emitter { Source = source };
                 Prepare(emitter);
                 Add(id, emitter);
@@ -246,7 +255,7 @@ namespace Nafir
             {
                 if (!emitters.TryGetValue(id, out var emitter)) return;
                 emitter.Source.GainDb = gainDb;
-                Order(NafirWire.SetGain(id, gainDb, rampS));
+                Order(NafirWire.SetGain(id, gainDb, rampS), id);
             }
         }
 
@@ -269,7 +278,7 @@ namespace Nafir
             {
                 if (!emitters.TryGetValue(id, out var emitter) || emitter.Source.Clip == null) return;
                 emitter.Stopped = true;
-                Order(NafirWire.StopEmitter(id, stopAt, fadeS, clockOffset));
+                Order(NafirWire.StopEmitter(id, stopAt, fadeS, clockOffset), id);
             }
         }
 
@@ -277,7 +286,7 @@ namespace Nafir
         {
             lock (gate)
             {
-                if (emitters.Remove(id)) Order(NafirWire.RemoveEmitter(id));
+                if (emitters.Remove(id)) Order(NafirWire.RemoveEmitter(id), id);
             }
         }
 
@@ -510,12 +519,13 @@ namespace Nafir
                 else if (type == "level_changed") LevelChanged(message);
                 else if (type == "pong" && (double)message["id"] == pingId) counts.RoundTripS = sincePing.Elapsed.TotalSeconds;
                 else if (emitter == null) { }
-                else if (type == "emitter_added") Open(emitter, (ulong)(double)message["sample_clock"]);
-                else if (type == "emitter_ended")
+                else if (type == "emitter_added" && emitter.IsOver)
                 {
-                    if ((bool)message["removed"]) emitters.Remove(id);
-                    ended = id;
+                    Order(NafirWire.RemoveEmitter(id), id); // the server goes by a snapshot from before it was heard, and begins it again
+                    ended = End(id, emitter, true);
                 }
+                else if (type == "emitter_added") Open(emitter, (ulong)(double)message["sample_clock"]);
+                else if (type == "emitter_ended") ended = End(id, emitter, (bool)message["removed"]);
                 else if (type == "error" && !emitter.Heard)
                 {
                     emitter.Refused = Stopwatch.StartNew();
@@ -524,8 +534,7 @@ namespace Nafir
                 }
                 else if (type == "error" && (string)message["code"] == "unknown_emitter" && emitter.PlaysOnce)
                 {
-                    emitters.Remove(id); // its end was said just before the connection was lost
-                    ended = id;
+                    ended = End(id, emitter, true); // its end was said just before the connection was lost
                 }
             }
             if (type == "error") Problem = $"{message["code"]}: {message["message"]}";
@@ -553,7 +562,7 @@ namespace Nafir
                 SampleRate = sampleRate;
                 if (everWelcomed) counts.Reconnections++;
                 everWelcomed = true;
-                if (message.TryGetValue("resumed", out var resumed) && resumed != null) GoOn((Dictionary<string, object>)resumed, entered);
+                if (message.TryGetValue("resumed", out var resumed) && resumed != null) GoOn((Dictionary<string, object>)resumed, over, entered);
                 else Begin(over);
             }
             foreach (var id in over) EmitterEnded?.Invoke(id);
@@ -561,27 +570,36 @@ namespace Nafir
             Become(NafirState.Live);
         }
 
-        /// <summary>The server has the stream still: it gets what it has not handled, and where everything is now.</summary>
-        void GoOn(Dictionary<string, object> resumed, List<string> entered)
+        /// <summary>The server has the stream still, or goes by a snapshot of it: it gets what it has not handled, and where everything is
+        /// now. What plays once and was heard since the snapshot is not begun again.</summary>
+        void GoOn(Dictionary<string, object> resumed, List<string> over, List<string> entered)
         {
             var handled = (long)(double)resumed["handled"];
             var clock = (ulong)(double)resumed["sample_clock"];
-            var again = orders.After(handled);
-            if (again == null)
+            if (!orders.CanResume(handled))
             {
                 Forget();
                 throw new IOException("too much was said while the connection was lost; the stream begins anew");
             }
             counts.Resumptions++;
-            foreach (var each in again) outgoing.Enqueue(each);
+            EndWhatIsOver(handled, over);
+            foreach (var each in orders.Resume(handled)) outgoing.Enqueue(each);
             foreach (var door in doorsMoved) Order(NafirWire.SetDoor(door, doors[door]));
             doorsMoved.Clear();
             poseId = Math.Max(poseId, (uint)(double)resumed["pose_id"]);
             foreach (var emitter in emitters.Values)
             {
                 emitter.Moved = true;
-                // What was added is there, and that it is heard may have been said just before the connection was lost.
-                if (emitter.Heard || emitter.Number <= handled) Open(emitter, clock);
+                if (!emitter.IsAmong(handled))
+                {
+                    emitter.Heard = false; // it is among what is sent again
+                }
+                else if (emitter.Heard ? emitter.Source.Clip == null : emitter.Refused == null)
+                {
+                    // That it is heard may have been said just before the connection was lost.
+                    var start = emitter.Source.StartAt ?? 0;
+                    Open(emitter, Math.Max(clock, start - Math.Min(start, clockOffset)));
+                }
             }
             var numbers = new Dictionary<string, int>();
             if (resumed.TryGetValue("listeners", out var listed))
@@ -591,7 +609,7 @@ namespace Nafir
             foreach (var pair in others)
             {
                 var other = pair.Value;
-                if (other.Order > handled) continue; // it is among what is sent again
+                if (other.Added != null && other.Added.Number > handled) continue; // it is among what is sent again
                 if (numbers.TryGetValue(pair.Key, out var number))
                 {
                     // That it is there may have been said just before the connection was lost.
@@ -602,9 +620,10 @@ namespace Nafir
             }
         }
 
-        /// <summary>The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.</summary>
+        /// <summary>The stream is a new one of the server's, whose clock is at 0. What plays once and was heard is not begun again.</summary>
         void Begin(List<string> over)
         {
+            EndWhatIsOver(0, over);
             if (ears.HasBlock)
             {
                 var awayS = Math.Max(0, sinceBlock.Elapsed.TotalSeconds - (double)bufferBlocks * blockSize / SampleRate);
@@ -627,19 +646,41 @@ namespace Nafir
             }
             foreach (var pair in emitters)
             {
-                if (pair.Value.Heard && pair.Value.PlaysOnce) over.Add(pair.Key);
-            }
-            foreach (var id in over) emitters.Remove(id);
-            foreach (var pair in emitters)
-            {
                 Prepare(pair.Value);
                 Add(pair.Key, pair.Value);
             }
         }
 
+        /// <summary>A connection was lost, and the server of the next one lacks what was ordered after number `handled`. Emitters among that
+        /// which play once, and have ended or were heard, end here.</summary>
+        void EndWhatIsOver(long handled, List<string> over)
+        {
+            foreach (var pair in emitters.ToArray())
+            {
+                var emitter = pair.Value;
+                emitter.WasHeard |= emitter.Heard && ears.HasBlock && emitter.StartClock < ears.NextClock;
+                if (!emitter.IsOver || emitter.IsAmong(handled)) continue;
+                if (End(pair.Key, emitter, true) != null) over.Add(pair.Key);
+            }
+        }
+
+        /// <summary>The clip of an emitter is over. The server does not have the emitter any more if it `isGone`. Returns its id if the game is to
+        /// be told.</summary>
+        string End(string id, Emitter emitter, bool isGone)
+        {
+            var isNews = !emitter.HasEnded;
+            emitter.HasEnded = true;
+            if (isGone)
+            {
+                emitters.Remove(id);
+                orders.End(emitter.Added);
+            }
+            return isNews ? id : null;
+        }
+
         void Prepare(Emitter emitter)
         {
-            emitter.Heard = false;
+            emitter.Heard = emitter.WasHeard = false;
             emitter.Sequence = 0;
             if (emitter.Source.Clip == null && SampleRate > 0) emitter.Dry = new NafirPlayback(1, outputRate, SampleRate, LiveTargetS);
         }
@@ -655,15 +696,13 @@ namespace Nafir
         void Add(string id, Emitter emitter)
         {
             emitter.Refused = null;
-            Order(NafirWire.AddEmitter(id, emitter.Source, clockOffset));
-            emitter.Number = orders.Count;
+            emitter.Added = Order(NafirWire.AddEmitter(id, emitter.Source, clockOffset), id);
         }
 
         void Ask(string id, Other other)
         {
             other.Refused = null;
-            Order(NafirWire.AddListener(id, other.Pose, other.Head));
-            other.Order = orders.Count;
+            other.Added = Order(NafirWire.AddListener(id, other.Pose, other.Head));
         }
 
         /// <summary>The server has a listener beside the first, under this number. Returns its id if that is news.</summary>
@@ -758,12 +797,12 @@ namespace Nafir
         }
 
         /// <summary>Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted
-        /// when it does.</summary>
-        void Order(string message)
+        /// when it does. `emitter` is the id of the one that the message is about. Returns null for what is not said.</summary>
+        NafirOrder Order(string message, string emitter = null)
         {
-            if (!welcomed && !CanResume) return;
-            orders.Add(message);
+            if (!welcomed && !CanResume) return null;
             if (welcomed) outgoing.Enqueue(message);
+            return orders.Add(message, emitter);
         }
 
         /// <summary>Says what a lost connection makes idle.</summary>

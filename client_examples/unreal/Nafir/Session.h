@@ -124,7 +124,7 @@ class Session {
     const auto found = emitters_.find(id);
     if (found != emitters_.end() && found->second.source.clip == source.clip) {
       Emitter& emitter = found->second;
-      if (emitter.source.gain_db != source.gain_db) Order(message::SetGain(id, source.gain_db));
+      if (emitter.source.gain_db != source.gain_db) Order(message::SetGain(id, source.gain_db), id);
       emitter.source = source;
       emitter.moved = true;
       return;
@@ -164,7 +164,7 @@ class Session {
     const auto found = emitters_.find(id);
     if (found == emitters_.end()) return;
     found->second.source.gain_db = gain_db;
-    Order(message::SetGain(id, gain_db, ramp_s));
+    Order(message::SetGain(id, gain_db, ramp_s), id);
   }
 
   // Opens a door of the scene so far, from 0, shut, to 1. Call it with each frame while a door swings.
@@ -184,11 +184,11 @@ class Session {
     const auto found = emitters_.find(id);
     if (found == emitters_.end() || found->second.source.clip.empty()) return;
     found->second.is_stopped = true;
-    Order(message::StopEmitter(id, fade_s, stop_at, clock_offset_));
+    Order(message::StopEmitter(id, fade_s, stop_at, clock_offset_), id);
   }
 
   void RemoveEmitter(const std::string& id) {
-    if (emitters_.erase(id) > 0) Order(message::RemoveEmitter(id));
+    if (emitters_.erase(id) > 0) Order(message::RemoveEmitter(id), id);
   }
 
   // Chooses a quality level, or auto.
@@ -307,11 +307,16 @@ class Session {
     } else if (type == "emitter_added") {
       const auto found = emitters_.find(id);
       if (found == emitters_.end()) return;
+      if (found->second.IsOver()) {
+        Order(message::RemoveEmitter(id), id);  // the server goes by a snapshot from before it was heard, and begins it again
+        TellEnded(End(found, true));
+        return;
+      }
       Open(found->second, Count(message["sample_clock"]));
       if (on_emitter_added) on_emitter_added(id);
     } else if (type == "emitter_ended") {
-      if (message["removed"].Bool()) emitters_.erase(id);
-      if (on_emitter_ended) on_emitter_ended(id);
+      const auto found = emitters_.find(id);
+      if (found != emitters_.end()) TellEnded(End(found, message["removed"].Bool()));
     }
   }
 
@@ -362,16 +367,29 @@ class Session {
   static constexpr double kPoseIntervalS = 0.012, kPingIntervalS = 1, kLiveTargetS = 0.04;
   static constexpr double kSilenceS = 4;  // a server that sends audio is never silent for so long
 
+  // A message that the server counts.
+  struct Ordered {
+    std::string text;
+    std::string emitter;       // the id of the one that it is about; empty if it is about none
+    std::uint64_t number = 0;  // how many there were with this one since the stream began
+    bool is_over = false;      // the emitter that it is about has ended, so that it is not sent again
+  };
+
   struct Emitter {
     Source source;
     bool moved = false, is_heard = false, is_stopped = false, is_refused = false;
+    bool was_heard = false;          // when a connection was lost
+    bool has_ended = false;          // and the game was told so
     double ask_again_s = 0;          // after a refusal; 0 for never
-    std::uint64_t number = 0;        // of the order that adds it
+    std::shared_ptr<Ordered> added;  // what adds it
     std::unique_ptr<Playback> dry;   // of a live one; from the output's rate to the stream's
     std::uint32_t sequence = 0;
     std::uint64_t start_clock = 0, sent_frames = 0;  // of the server
 
     bool PlaysOnce() const { return !source.clip.empty() && (!source.loop || is_stopped); }
+
+    // Whether a server that does not have it is not to begin it again.
+    bool IsOver() const { return has_ended || (PlaysOnce() && was_heard); }
   };
 
   // A listener beside the first.
@@ -381,7 +399,7 @@ class Session {
     std::string head;
     bool moved = false, has_been = false, is_refused = false;
     double ask_again_s = 0;             // after a refusal
-    std::uint64_t order = 0;            // the number of the order that adds it
+    std::shared_ptr<Ordered> added;      // what adds it
     std::optional<std::uint8_t> number;  // in the headers of its blocks, once the server has it
   };
 
@@ -400,6 +418,43 @@ class Session {
     snapshot_.clear();
     orders_.clear();
     ordered_ = 0;
+  }
+
+  // Whether an emitter or a listener is there after so many orders.
+  template <typename Added>
+  static bool IsAmong(const Added& what, std::uint64_t handled) {
+    return !what.added || what.added->number <= handled;
+  }
+
+  // The clip of an emitter is over. The server does not have the emitter any more if it `is_gone`. Returns its id where the game is to be told.
+  std::vector<std::string> End(std::map<std::string, Emitter>::iterator found, bool is_gone) {
+    std::vector<std::string> news;
+    if (!found->second.has_ended) news.push_back(found->first);
+    found->second.has_ended = true;
+    if (is_gone) {
+      EndOrders(found->second.added);
+      emitters_.erase(found);
+    }
+    return news;
+  }
+
+  void TellEnded(const std::vector<std::string>& ids) {
+    if (!on_emitter_ended) return;
+    for (const std::string& id : ids) on_emitter_ended(id);
+  }
+
+  // A connection was lost, and the server of the next one lacks what was ordered after number `handled`. Emitters among that which play once,
+  // and have ended or were heard, end here. Returns the ids of those of which the game is to be told.
+  std::vector<std::string> EndWhatIsOver(std::uint64_t handled) {
+    std::vector<std::string> ended;
+    for (auto next = emitters_.begin(); next != emitters_.end();) {
+      const auto found = next++;
+      Emitter& emitter = found->second;
+      if (emitter.is_heard && ears_.has_block_ && emitter.start_clock < ears_.next_clock_) emitter.was_heard = true;
+      if (!emitter.IsOver() || IsAmong(emitter, handled)) continue;
+      for (const std::string& id : End(found, true)) ended.push_back(id);
+    }
+    return ended;
   }
 
   void Become(State next) {
@@ -438,19 +493,28 @@ class Session {
     for (const std::string& id : entered) on_listener_added(id);
   }
 
-  // The server has the stream still: it gets what it has not handled, and where everything is now.
+  // The server has the stream still, or goes by a snapshot of it: it gets what it has not handled, and where everything is now. What plays once
+  // and was heard since the snapshot is not begun again.
   void GoOn(std::uint64_t handled, std::uint64_t clock, std::uint32_t pose_id) {
     ++counts_.resumptions;
+    const std::vector<std::string> ended = EndWhatIsOver(handled);
     Handled(handled);
-    for (const std::string& each : orders_) outgoing_.push_back({true, each});
+    DropOrders();
+    for (const auto& each : orders_) outgoing_.push_back({true, each->text});
     for (const std::string& door : doors_moved_) Order(message::SetDoor(door, doors_[door]));
     doors_moved_.clear();
     pose_id_ = std::max(pose_id_, pose_id);
     for (auto& [id, emitter] : emitters_) {
       emitter.moved = true;
-      // What was added is there, and that it is heard may have been said just before the connection was lost.
-      if (emitter.is_heard || emitter.number <= handled) Open(emitter, clock);
+      if (!IsAmong(emitter, handled)) {
+        emitter.is_heard = false;  // it is among what is sent again
+      } else if (emitter.is_heard ? emitter.source.clip.empty() : !emitter.is_refused) {
+        // That it is heard may have been said just before the connection was lost.
+        const std::uint64_t start = emitter.source.start_at.value_or(0);
+        Open(emitter, std::max(clock, start - std::min(start, clock_offset_)));
+      }
     }
+    TellEnded(ended);
   }
 
   // Listeners that the server has go on. Those that it should have and has not are asked for again. Returns the ids of those that are news.
@@ -459,7 +523,7 @@ class Session {
     for (const Json& each : there.Items()) numbers[each["id"].Text()] = static_cast<std::uint8_t>(Count(each["index"]));
     std::vector<std::string> entered;
     for (auto& [id, other] : others_) {
-      if (other.order > handled) continue;  // it is among what is sent again
+      if (!IsAmong(other, handled)) continue;  // it is among what is sent again
       const auto found = numbers.find(id);
       if (found != numbers.end()) {
         // That it is there may have been said just before the connection was lost.
@@ -473,8 +537,9 @@ class Session {
     return entered;
   }
 
-  // The stream is a new one of the server's, whose clock is at 0. What plays once is not begun again.
+  // The stream is a new one of the server's, whose clock is at 0. What plays once and was heard is not begun again.
   void BeginAnew() {
+    const std::vector<std::string> ended = EndWhatIsOver(0);
     if (ears_.has_block_) {
       const double away_s = std::max(0.0, since_block_s_ - static_cast<double>(options_.buffer_blocks * options_.block_size) / sample_rate_);
       clock_offset_ = sample_clock_ + static_cast<std::uint64_t>(away_s * sample_rate_);
@@ -493,23 +558,15 @@ class Session {
       other.ears->BeginAnew();
       Ask(id, other);
     }
-    std::vector<std::string> over;
     for (auto& [id, emitter] : emitters_) {
-      if (emitter.is_heard && emitter.PlaysOnce()) {
-        over.push_back(id);
-        continue;
-      }
       Prepare(emitter);
       Add(id, emitter);
     }
-    for (const std::string& id : over) {
-      emitters_.erase(id);
-      if (on_emitter_ended) on_emitter_ended(id);
-    }
+    TellEnded(ended);
   }
 
   void Prepare(Emitter& emitter) {
-    emitter.is_heard = emitter.moved = false;
+    emitter.is_heard = emitter.was_heard = emitter.moved = false;
     emitter.sequence = 0;
     if (emitter.source.clip.empty() && sample_rate_ > 0) {
       emitter.dry = std::make_unique<Playback>(1, options_.output_rate, sample_rate_, kLiveTargetS);
@@ -525,14 +582,12 @@ class Session {
 
   void Add(const std::string& id, Emitter& emitter) {
     emitter.is_refused = false;
-    Order(message::AddEmitter(id, emitter.source, clock_offset_));
-    emitter.number = ordered_;
+    emitter.added = Order(message::AddEmitter(id, emitter.source, clock_offset_), id);
   }
 
   void Ask(const std::string& id, Other& other) {
     other.is_refused = false;
-    Order(message::AddListener(id, other.pose, other.head));
-    other.order = ordered_;
+    other.added = Order(message::AddListener(id, other.pose, other.head));
   }
 
   // The server has a listener beside the first, under this number. Returns whether that is news.
@@ -605,9 +660,7 @@ class Session {
       emitter.ask_again_s = error["retry_after_s"].Number();
       if (on_emitter_refused) on_emitter_refused(id, problem_);
     } else if (error["code"].Text() == "unknown_emitter" && emitter.PlaysOnce()) {
-      const std::string ended = id;  // its end was said just before the connection was lost
-      emitters_.erase(found);
-      if (on_emitter_ended) on_emitter_ended(ended);
+      TellEnded(End(found, true));  // its end was said just before the connection was lost
     }
   }
 
@@ -644,12 +697,27 @@ class Session {
   }
 
   // Says what the server counts: now, or once the stream is resumed. A stream that is yet to begin is told all that is wanted when it does.
-  void Order(const std::string& text) {
-    if (state_ != State::kLive && !CanResume()) return;
-    orders_.push_back(text);
-    ++ordered_;
+  // `emitter` is the id of the one that the message is about. Returns null for what is not said.
+  std::shared_ptr<Ordered> Order(const std::string& text, const std::string& emitter = {}) {
+    if (state_ != State::kLive && !CanResume()) return nullptr;
+    orders_.push_back(std::make_shared<Ordered>(Ordered{text, emitter, ++ordered_, false}));
     if (orders_.size() > kMostOrders) orders_.pop_front();
     if (state_ == State::kLive) outgoing_.push_back({true, text});
+    return orders_.back();
+  }
+
+  // The emitter that an order has added is over and gone: if the order is kept still, neither it nor what was said of the emitter since is sent
+  // again.
+  void EndOrders(const std::shared_ptr<Ordered>& added) {
+    if (std::find(orders_.begin(), orders_.end(), added) == orders_.end()) return;
+    for (const auto& each : orders_) each->is_over |= each->emitter == added->emitter && each->number >= added->number;
+  }
+
+  // Lets go of orders that are over. The others have the numbers by which the server is going to count them.
+  void DropOrders() {
+    ordered_ -= orders_.size();
+    orders_.erase(std::remove_if(orders_.begin(), orders_.end(), [](const auto& each) { return each->is_over; }), orders_.end());
+    for (const auto& each : orders_) each->number = ++ordered_;
   }
 
   // So many orders need not be sent again.
@@ -678,7 +746,7 @@ class Session {
   std::map<std::string, double> doors_;  // those that the game has moved
   std::set<std::string> doors_moved_;    // of them, while there was no connection
   std::deque<Outgoing> outgoing_;
-  std::deque<std::string> orders_;  // the newest messages that the server counts, and how many there were
+  std::deque<std::shared_ptr<Ordered>> orders_;  // the newest messages that the server counts, and how many there were
   std::uint64_t ordered_ = 0;
   std::string token_, snapshot_;  // with which the stream is resumed
   Json last_error_;               // of the whole stream, in this connection
