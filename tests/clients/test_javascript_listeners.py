@@ -23,6 +23,7 @@ from server.protocol.client_messages import (
     StopEmitter,
     parse_client_message,
 )
+from tests.clients import one_shots
 from tests.clients.test_javascript import HERE, MODULES, NODE
 from tests.clients.test_python_wire import WELCOME
 
@@ -345,8 +346,8 @@ def clip(identifier, **more):
     return ["emitter", {"id": identifier, "clip": "bell", **at(2), **more}]
 
 
-def heard(identifier):
-    return ["receive", {"type": "emitter_added", "id": identifier, "sample_clock": 0}]
+def heard(identifier, clock=0):
+    return ["receive", {"type": "emitter_added", "id": identifier, "sample_clock": clock}]
 
 
 def test_clips_start_and_stop_at_clocks_and_gains_ramp(tmp_path):
@@ -416,9 +417,82 @@ def test_what_was_heard_to_its_end_since_the_snapshot_is_not_played_again(tmp_pa
     assert of(SetLevel, again) == [SetLevel(level="auto")]
 
 
+def shots(said):
+    """As tests/clients/one_shots.py has it, with `removed` for an emitter that is gone though its end was told."""
+    sent, told = said
+    words = [f"{each.type}:{each.id}" for each in sent if isinstance(each, AddEmitter | RemoveEmitter | SetGain)]
+    ends = [each["ended"] for each in told if "ended" in each]
+    return sorted([*words, *(f"{'removed' if each['removed'] else 'ended'}:{each['id']}" for each in ends)])
+
+
+def test_clips_that_play_once_and_were_heard_are_not_played_again_when_their_server_is_lost(tmp_path):
+    forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
+    _, *steps = run(
+        tmp_path,
+        OPENED,
+        [
+            *[clip("loop"), clip("again", loop=False), heard("loop")],
+            ["receive", snapshot("sealed", 2)],
+            *[clip(name, loop=False) for name in ("over", "stays", "heard", "waiting")],
+            clip("later", loop=False, startAt=1_000_000),
+            *[heard(name) for name in ("again", "over", "stays", "heard")],
+            heard("later", 1_000_000),
+            clip("heard", loop=False, gainDb=-3),
+            *[["receive", ended("over", True)], ["receive", ended("stays", False)]],
+            ["receive", block_of(0, 0, 0)],
+        ],
+        [*LOST, ["receive", resumed(handled=2)], ["pause", SETTLED_MS]],
+        [heard("again", 5_120)],
+        [["receive", ended(name, True)] for name in ("again", "over", "heard")],
+        [*LOST, ["receive", resumed(handled=4)], ["pause", SETTLED_MS]],
+        [
+            *[heard("waiting", 6_000), ["receive", block_of(0, 48, 6_144)], ["lose", 1006], ["reconnect", None]],
+            *[["open", None], ["receive", forgotten], ["lose", 1008], ["open", None], ["receive", NEW]],
+        ],
+    )
+    wanted = [step.split() for step in one_shots.STEPS]
+    begun, gone_on, again, told_again, by_the_number, anew = map(shots, steps)
+    assert begun == sorted([*set(wanted[0]) - {"ended:over"}, "removed:over"])
+    assert gone_on == ["add_emitter:later", "add_emitter:waiting", "removed:heard", "removed:stays"]
+    assert again == ["remove_emitter:again", "removed:again"]
+    assert told_again == wanted[3]
+    assert by_the_number == wanted[4]
+    assert anew == ["add_emitter:later", "add_emitter:loop", "removed:waiting"]
+
+
+def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent(tmp_path):
+    *_, gone_on = run(
+        tmp_path,
+        OPENED,
+        [
+            ["receive", snapshot("sealed", 0)],
+            *[clip("shot", loop=False), heard("shot"), ["receive", block_of(0, 0, 0)]],
+            *[["lose", 1006], clip("shot", loop=False, gainDb=-3), ["level", "auto"]],
+            *[["reconnect", None], ["open", None]],
+        ],
+        [["receive", resumed(handled=0)], ["pause", SETTLED_MS]],
+    )
+    assert [type(each) for each in gone_on[0]] == [SetLevel, ListenerPose]
+
+
+def test_a_clip_whose_id_is_given_again_in_an_outage_is_played(tmp_path):
+    *_, gone_on = run(
+        tmp_path,
+        OPENED,
+        [
+            ["receive", snapshot("sealed", 0)],
+            *[clip("shot", loop=False), heard("shot"), ["receive", block_of(0, 0, 0)]],
+            *[["lose", 1006], ["removeEmitter", "shot"], clip("shot", loop=False), ["reconnect", None], ["open", None]],
+        ],
+        [["receive", resumed(handled=0)], ["pause", SETTLED_MS]],
+    )
+    assert [type(each) for each in gone_on[0]][:3] == [AddEmitter, RemoveEmitter, AddEmitter]
+    assert [each for each in gone_on[1] if "ended" in each] == []
+
+
 def test_a_new_stream_goes_on_with_the_clock_and_begins_no_clip_again_that_plays_once(tmp_path):
     forgotten = {"type": "error", "code": "unknown_resume_token", "message": "no", "field": "token"}
-    begun = [heard(name) for name in ("loop", "once", "stopped")]
+    begun = [*[heard(name) for name in ("loop", "once", "stopped")], heard("waiting", 48_000)]
     _, _, anew, there = run(
         tmp_path,
         OPENED,

@@ -19,6 +19,7 @@ from nafir_client.wire import Block
 from server.acoustics.spherical_harmonics import even_directions, real_harmonics
 from server.acoustics.spherical_harmonics import rotation as server_rotation
 from server.protocol.blocks import AudioBlock
+from tests.clients import one_shots
 from tests.clients.test_python_wire import WELCOME
 
 
@@ -354,18 +355,150 @@ def test_where_no_stream_is_kept_a_hello_begins_anew():
     assert [json.loads(each)["type"] for each in drained(session.outbox)] == ["add_emitter"]
 
 
+def add_clip(session, name, **more):
+    return session.add_emitter({"id": name, "clip": "noise", "position": (1.0, 2.0, 1.0), **more}, None)
+
+
+def tell_added(session, name, clock):
+    session.receive(json.dumps({"type": "emitter_added", "id": name, "sample_clock": clock}), 0.0)
+
+
+def tell_ended(session, name, removed):
+    session.receive(json.dumps({"type": "emitter_ended", "id": name, "sample_clock": 9, "removed": removed}), 0.0)
+
+
 def test_a_new_stream_plays_no_clip_again_that_plays_once():
     session = Session("flat", {})
     session.greet(WELCOME, 0.0)
     for name, loop in [("once", False), ("waiting", False), ("loop", True)]:
-        session.add_emitter({"id": name, "clip": "noise", "loop": loop, "position": (1.0, 2.0, 1.0)}, None)
+        add_clip(session, name, loop=loop)
     for name in ("once", "loop"):
-        session.receive(f'{{"type": "emitter_added", "id": "{name}", "sample_clock": 0}}', 0.0)
+        tell_added(session, name, 0)
+    session.receive(wire_block(0, 0), 0.0)
     once = session.emitters["once"]
     session.first_message()
     session.greet(WELCOME, 1.0)
     assert [json.loads(each)["id"] for each in drained(session.outbox)] == ["waiting", "loop"]
     assert once.has_ended
+
+
+def lose_and_resume(session, handled, clock):
+    session.disconnect()
+    assert json.loads(session.first_message())["type"] == "resume"
+    session.greet(resumable(sample_clock=clock, sequence=0, pose_id=0, handled=handled), 0.0)
+
+
+def begin_anew(session):
+    session.disconnect()
+    session.first_message()
+    with pytest.raises(RefusedError):
+        session.greet('{"type": "error", "code": "unknown_resume_token", "message": "no"}', 0.0)
+    assert json.loads(session.first_message())["type"] == "hello"
+    session.greet(resumable(), 0.0)
+
+
+def test_clips_that_play_once_and_were_heard_are_not_played_again_when_their_server_is_lost():
+    session, emitters, known = Session("flat", {}), {}, set()
+
+    def add(name, **more):
+        emitters[name] = add_clip(session, name, **more)
+
+    def said():
+        ended = {name for name, emitter in emitters.items() if emitter.has_ended}
+        news = [f"ended:{name}" for name in ended - known]
+        known.update(ended)
+        messages = [json.loads(each) for each in drained(session.outbox)]
+        return " ".join(sorted(news + [f"{each['type']}:{each['id']}" for each in messages]))
+
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    add("loop")
+    add("again", loop=False)
+    first = said()
+    tell_added(session, "loop", 0)
+    session.receive(snapshot("sealed", 2), 0.0)
+    for name in ("over", "stays", "heard", "waiting"):
+        add(name, loop=False)
+    add("later", loop=False, start_at=1_000_000)
+    first += f" {said()}"
+    for name in ("again", "over", "stays", "heard"):
+        tell_added(session, name, 0)
+    tell_added(session, "later", 1_000_000)
+    session.set_gain(emitters["heard"], -3.0, 0.0)
+    first += f" {said()}"
+    tell_ended(session, "over", True)
+    tell_ended(session, "stays", False)
+    session.receive(wire_block(0, 0), 0.0)
+    steps = [" ".join(sorted(f"{first} {said()}".split()))]
+    lose_and_resume(session, 2, 5_000)
+    steps.append(said())
+    tell_added(session, "again", 5_120)
+    steps.append(said())
+    for name in ("again", "over", "heard"):
+        tell_ended(session, name, True)
+    steps.append(said())
+    lose_and_resume(session, 4, 5_376)
+    steps.append(said())
+    tell_added(session, "waiting", 6_000)
+    session.receive(wire_block(24, 6_144), 0.0)
+    begin_anew(session)
+    steps.append(said())
+    one_shots.check(steps)
+    assert set(session.emitters) == {"later", "loop"}
+
+
+def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.receive(snapshot("sealed", 0), 0.0)
+    shot = add_clip(session, "shot", loop=False)
+    drained(session.outbox)
+    tell_added(session, "shot", 0)
+    session.receive(wire_block(0, 0), 0.0)
+    session.disconnect()
+    session.set_gain(shot, -3.0, 0.0)
+    session.move_emitter(shot, (2.0, 2.0, 1.0), None, 0.0)
+    session.set_level("auto")
+    lose_and_resume(session, 0, 5_000)
+    assert [json.loads(each)["type"] for each in drained(session.outbox)] == ["set_level"]
+
+
+def test_a_clip_whose_id_is_given_again_in_an_outage_is_played():
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    session.receive(snapshot("sealed", 0), 0.0)
+    shot = add_clip(session, "shot", loop=False)
+    drained(session.outbox)
+    tell_added(session, "shot", 0)
+    session.receive(wire_block(0, 0), 0.0)
+    session.disconnect()
+    session.remove_emitter(shot)
+    again = add_clip(session, "shot", loop=False)
+    lose_and_resume(session, 0, 5_000)
+    assert [json.loads(each)["type"] for each in drained(session.outbox)][-2:] == ["remove_emitter", "add_emitter"]
+    assert session.emitters == {"shot": again}
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_clip_that_is_yet_to_start_is_asked_for_by_a_new_stream(is_told):
+    session = Session("flat", {})
+    session.first_message()
+    session.greet(resumable(), 0.0)
+    later = add_clip(session, "later", loop=False, start_at=48_000)
+    drained(session.outbox)
+    if is_told:
+        tell_added(session, "later", 48_000)
+    else:  # it may have been said just before the connection was lost
+        lose_and_resume(session, 1, 256)
+    session.receive(wire_block(2, 512), 0.0)
+    assert later.start_clock == 48_000
+    begin_anew(session)
+    [added] = [json.loads(each) for each in drained(session.outbox)]
+    assert (added["type"], added["id"], later.has_ended) == ("add_emitter", "later", False)
+    block = session.receive(wire_block(0, 0), 0.1)
+    assert added["start_at"] == 48_000 - block.sample_clock
 
 
 def test_messages_and_blocks_of_a_newer_server_are_ignored(session):

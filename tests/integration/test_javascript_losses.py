@@ -111,3 +111,39 @@ def test_what_was_acknowledged_since_the_last_snapshot_is_said_again(browser, bu
         page.wait_for_timeout(2_000)
         assert visitor.level_db(listen(page)).max() < -70  # the talker is gone, as was said after the snapshot
         assert page.evaluate("refusals") == []
+
+
+def test_a_clip_that_plays_once_and_was_heard_is_not_played_by_another_server(browser, bundle, hrtfs, monkeypatch):
+    """The snapshot is older than the clip, as that of a server which dies."""
+    levels = FieldsByLevel.load(bundle)
+    snapshots = Snapshots(monkeypatch)
+    with (
+        serving(levels, hrtfs, resume_secret=SECRET) as old,
+        serving(levels, hrtfs, resume_secret=SECRET) as new,
+        LossyProxy(old).running() as network,
+        visiting(browser, network) as page,
+    ):
+        snapshots.end_with(1)  # message: the talker, and nothing that comes later
+        page.evaluate("""() => {
+          window.ends = [];
+          nafir.addEventListener("ended", ({ detail }) => ends.push(detail));
+          const shot = { clip: "trumpet", loop: false, position: [6, 3, 1.5] };
+          nafir.addEmitter({ ...shot, id: "heard" });
+          nafir.addEmitter({ ...shot, id: "stays", offsetS: 5 });
+          nafir.addEmitter({ ...shot, id: "over", offsetS: 5, removeWhenEnded: true });
+          nafir.addEmitter({ ...shot, id: "later", startAt: nafir.sampleClock + 1e9 });
+          talker.gainDb = -70;
+        }""")
+        page.wait_for_function("ends.length >= 2", timeout=visitor.WAIT_MS)
+        before = visitor.level_db(listen(page)[0])
+        told = page.evaluate("ends")
+        assert sorted(each["id"] for each in told) == ["over", "stays"]
+        network.redirect(new)
+        network.cut()
+        assert resumed(page)["handled"] == 1
+        page.wait_for_timeout(2_000)
+        assert page.evaluate("ends")[2:] == [{"id": "heard", "removed": True}]
+        assert page.evaluate("[...nafir.emitters.keys()].filter((id) => id !== talker.id)") == ["later"]
+        after = visitor.level_db(listen(page)[0])
+        assert page.evaluate("refusals") == []
+    assert after < before - 20

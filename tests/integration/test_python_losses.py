@@ -167,6 +167,45 @@ def test_what_was_acknowledged_since_the_last_snapshot_is_said_again(bundle, hrt
     assert quieter_error_db(heard, expected, since) < -80
 
 
+def test_a_clip_that_plays_once_and_was_heard_is_not_played_by_another_server(bundle, hrtfs, monkeypatch):
+    """The snapshot is older than the clip, as that of a server which dies."""
+    Snapshots(monkeypatch).keep_to(1)
+
+    async def listen(network, new):
+        notes = Notes()
+        async with connect(network.address, notes) as stream:
+            await stream.add_emitter(clip=CLIP, position=PLACE, gain_db=-70)
+            await notes.next_snapshot()
+            shot = {"clip": "trumpet", "loop": False, "position": PLACE}
+            heard = await stream.add_emitter(**shot, id="heard")
+            stays = await stream.add_emitter(**shot, id="stays", offset_s=5)
+            over = await stream.add_emitter(**shot, id="over", offset_s=5, remove_when_ended=True)
+            before = await hear(stream, RATE // 2)
+            await asyncio.gather(stays.wait_until_ended(), over.wait_until_ended())
+            assert not heard.has_ended
+            end = asyncio.create_task(heard.wait_until_ended())
+            network.redirect(new)
+            network.cut()
+            blocks = await hear_anew(stream, 2 * RATE)
+            await end
+            assert stream.welcome.given["resumed"]["handled"] == 1
+            later = await stream.add_emitter(**shot, id="stays", offset_s=5)  # nobody has the id
+            assert not later.has_ended
+            return before, blocks, notes.errors
+
+    other_server = serving_until_drained(bundle, hrtfs)
+    with (
+        serving_until_drained(bundle, hrtfs) as (old, _),
+        other_server as (new, _),
+        LossyProxy(old).running() as network,
+    ):
+        before, blocks, errors = running(listen(network, new))
+    assert errors == []
+    loudest = max(abs(block.samples).max() for block in before)
+    # The first emitter is there again, and next to silent.
+    assert 0 < max(abs(block.samples).max() for block in after(blocks, RATE)) < 0.01 * loudest
+
+
 @pytest.mark.long
 def test_a_stream_whose_snapshot_another_secret_signed_begins_anew(served, bundle, hrtfs, monkeypatch):
     Snapshots(monkeypatch)

@@ -6,23 +6,25 @@ sent again.
 """
 
 from collections import deque
-from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterable, Set
+from dataclasses import dataclass
 from typing import Final, Literal
 
-Added = Literal["emitter", "listener"]
+Thing = tuple[Literal["emitter", "listener"], str]
+"""The kind and the id of an emitter or listener."""
 _MOST_KEPT: Final = 1_000
 """Counted messages that are kept."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Outgoing:
-    """A message. `adds` is what it adds, if it does: the kind and the id of an emitter or listener. Once that has ended
-    by itself, the message `is_over`, and is not sent again."""
+    """A message. `about` is the emitter or listener that it adds, if it `adds` one, or changes. Once that has ended by
+    itself, the message `is_over`, and is not sent again."""
 
     data: str | bytes
     is_counted: bool = False
-    adds: tuple[Added, str] | None = None
+    about: Thing | None = None
+    adds: bool = False
     is_over: bool = False
 
 
@@ -57,9 +59,9 @@ class Outbox:
         return message.data
 
     @property
-    def adds(self) -> set[tuple[Added, str]]:
-        """Kinds and ids of what waiting messages add."""
-        return {message.adds for message in self._waiting.values() if message.adds is not None}
+    def adds(self) -> set[Thing]:
+        """What waiting messages add."""
+        return {message.about for message in self._waiting.values() if message.adds and message.about is not None}
 
     def begin(self) -> None:
         """A new stream begins, of which nothing waits and nothing was sent."""
@@ -79,22 +81,36 @@ class Outbox:
         """Whether all counted messages but the first so many are still there."""
         return self._sent_count - handled <= len(self._sent)
 
-    def end(self, added: tuple[Added, str]) -> None:
-        """What the newest message with these `adds` has added has ended by itself."""
-        for index in reversed(range(len(self._sent))):
-            if self._sent[index].adds == added:
-                self._sent[index] = replace(self._sent[index], is_over=True)
-                return
+    def end(self, thing: Thing) -> None:
+        """It has ended by itself. What added it, and what was said about it since, is over."""
+        _end(self._sent, thing)
 
     def forget(self, handled: int) -> None:
         """The first so many counted messages need not be sent again."""
         while self._sent and self._sent_count - len(self._sent) < handled:
             self._sent.popleft()
 
-    def resume(self, handled: int) -> None:
-        """The server has handled so many counted messages of this stream. The others wait again, before all else."""
+    def resume(self, handled: int, played: Set[Thing] = frozenset()) -> set[Thing]:
+        """The server has handled so many counted messages of this stream. The others wait again, before all else, but
+        for those that are over. So are, of things in `played` that the server lacks, what would add them and what was
+        said about them since. Returns those things."""
         assert self.can_resume(handled)
         lost = max(0, self._sent_count - handled)
         again = [self._sent.pop() for _ in range(lost)][::-1]
         self._sent_count -= lost
         self.put_first([message for message in again if not message.is_over])
+        lacking = self.adds & played
+        for thing in lacking:
+            _end(self._waiting.values(), thing)
+        self._waiting = {key: message for key, message in self._waiting.items() if not message.is_over}
+        return lacking
+
+
+def _end(messages: Iterable[Outgoing], thing: Thing) -> None:
+    """The newest of the messages that adds a thing, and those about it after that, are over."""
+    since: list[Outgoing] = []
+    for message in messages:
+        if message.about == thing and (since or message.adds):
+            since = [message] if message.adds else [*since, message]
+    for message in since:
+        message.is_over = True

@@ -17,7 +17,7 @@ from typing import Any, Literal, TypedDict
 from nafir_client.errors import ProtocolError, RefusedError
 from nafir_client.live_input import LiveInput
 from nafir_client.opus import OpusReader, OpusWriter, require_opus
-from nafir_client.outbox import Outbox, Outgoing
+from nafir_client.outbox import Outbox, Outgoing, Thing
 from nafir_client.pose import Orientation, Pose, Position
 from nafir_client.scene import Welcome
 from nafir_client.stream_statistics import ListenerStatistics, StreamStatistics
@@ -125,14 +125,21 @@ class SessionEmitter:
         """Whether the server of the present connection has said that it is heard."""
         self.start_clock = 0
         """The clock from which on it is heard, or was in the last stream of the server's."""
+        self.was_heard = False
+        """Whether some of it had been heard when a connection was lost."""
         self.has_ended = False
-        """Whether all sound of its clip has been heard."""
+        """Whether all sound of its clip has been heard, or no more will be."""
         self.pose_id = 0
         """That of its newest move."""
 
     @property
     def plays_once(self) -> bool:
         return "clip" in self.fields and not self.fields.get("loop", True)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a server that does not have it is not to begin it again."""
+        return self.has_ended or (self.plays_once and self.was_heard)
 
 
 class SessionListener:
@@ -213,11 +220,11 @@ class Session:
     def _open(self) -> str:
         """A hello. What the stream had before is asked for once it is answered."""
         self.outbox.begin()
+        self._note_heard()
         for emitter in tuple(self.emitters.values()):
-            if emitter.has_ended or (emitter.plays_once and emitter.is_heard):
-                emitter.has_ended = True  # what plays once is not played again
-                del self.emitters[emitter.id]
-            emitter.is_heard = False
+            if emitter.is_over:
+                self._end(emitter)  # what plays once is not played again
+            emitter.is_heard = emitter.was_heard = False
         for listener in self.listeners.values():
             listener.index = None
         self._restored = list(self.emitters.values())
@@ -230,6 +237,17 @@ class Session:
         if self.listeners:
             hello["listeners"] = max(hello.get("listeners", 0), 1 + len(self.listeners))
         return json.dumps(hello)
+
+    def _note_heard(self) -> None:
+        """The connection was lost: note which emitters were heard in the last block or before it."""
+        for emitter in self.emitters.values():
+            if emitter.is_heard and emitter.start_clock < self.next_clock:
+                emitter.was_heard = True
+
+    def _end(self, emitter: SessionEmitter) -> None:
+        """Its clip is over, and the server does not have it any more."""
+        emitter.has_ended = True
+        del self.emitters[emitter.id]
 
     def greet(self, data: str | bytes, now_s: float) -> Welcome:
         """Take the answer to the first message. Raises RefusedError or ProtocolError."""
@@ -267,8 +285,12 @@ class Session:
         self._resume_token = self._snapshot = None
 
     def _resume(self, pose_id: int, handled: int, sample_clock: int, now_s: float) -> None:
-        """The stream goes on where it would be: what the server has not got is sent again."""
-        self.outbox.resume(handled)
+        """The stream goes on where it would be: what the server has not got is sent again, but for what plays once and
+        was heard since a snapshot."""
+        self._note_heard()
+        over: set[Thing] = {("emitter", emitter.id) for emitter in self.emitters.values() if emitter.is_over}
+        for _, identifier in self.outbox.resume(handled, over):
+            self._end(self.emitters[identifier])
         added = self.outbox.adds
         if self.listener is not None and self._listener_pose_id > pose_id:
             self.move_listener(self.listener, now_s)
@@ -280,7 +302,8 @@ class Session:
                 emitter.is_heard = False  # a server that goes by a snapshot may lack what the last one had
             elif not emitter.is_heard:
                 # It is there, and that it is heard may have been said just before the connection was lost.
-                emitter.is_heard, emitter.start_clock = True, sample_clock + self._clock_offset
+                start = max(sample_clock + self._clock_offset, emitter.fields.get("start_at", 0))
+                emitter.is_heard, emitter.start_clock = True, start
             if emitter.live and emitter.is_heard:
                 emitter.live.open()
 
@@ -409,24 +432,25 @@ class Session:
             moved["orientation"] = orientation
         emitter.fields.update(moved)
         emitter.pose_id = pose_id = self._new_pose(self.statistics, now_s)
-        self._put({"type": "move_emitter", "id": emitter.id, "pose_id": pose_id, **moved}, ("move", emitter.id))
+        move = {"type": "move_emitter", "id": emitter.id, "pose_id": pose_id, **moved}
+        self._put(move, ("move", emitter.id), emitter)
         return pose_id
 
     def set_gain(self, emitter: SessionEmitter, gain_db: float, ramp_s: float) -> None:
         emitter.fields["gain_db"] = gain_db
         ramp = {"ramp_s": ramp_s} if ramp_s else {}
-        self._put({"type": "set_gain", "id": emitter.id, "gain_db": gain_db, **ramp}, ("gain", emitter.id))
+        self._put({"type": "set_gain", "id": emitter.id, "gain_db": gain_db, **ramp}, ("gain", emitter.id), emitter)
 
     def stop_emitter(self, emitter: SessionEmitter, stop_at: int | None, fade_s: float) -> None:
         """Let its clip fade out from a clock on, or at once."""
         at = {} if stop_at is None else {"stop_at": max(0, stop_at - self._clock_offset)}
         emitter.fields["loop"] = False  # what was stopped is not begun again by a new connection
-        self._put({"type": "stop_emitter", "id": emitter.id, "fade_s": fade_s, **at})
+        self._put({"type": "stop_emitter", "id": emitter.id, "fade_s": fade_s, **at}, emitter=emitter)
 
     def remove_emitter(self, emitter: SessionEmitter) -> None:
         if self.emitters.get(emitter.id) is emitter:
             del self.emitters[emitter.id]
-            self._put({"type": "remove_emitter", "id": emitter.id})
+            self._put({"type": "remove_emitter", "id": emitter.id}, emitter=emitter)
 
     def forget_emitter(self, emitter: SessionEmitter, error: RefusedError) -> None:
         """The server has refused it. One whom the error does not name is removed, since the server may be about to have
@@ -482,7 +506,8 @@ class Session:
         for name in ("start_at", "stop_at"):
             if name in fields:
                 fields[name] = max(0, fields[name] - self._clock_offset)
-        return Outgoing(json.dumps({"type": "add_emitter", **fields}), is_counted=True, adds=("emitter", emitter.id))
+        added = json.dumps({"type": "add_emitter", **fields})
+        return Outgoing(added, is_counted=True, about=("emitter", emitter.id), adds=True)
 
     def _added_listener(self, listener: SessionListener) -> Outgoing:
         """What adds a listener where it is by now."""
@@ -490,7 +515,7 @@ class Session:
         if listener.hrtf is not None:
             fields["hrtf"] = listener.hrtf
         added = json.dumps({"type": "add_listener", **fields})
-        return Outgoing(added, is_counted=True, adds=("listener", listener.id))
+        return Outgoing(added, is_counted=True, about=("listener", listener.id), adds=True)
 
     def _begin_listener(self, listener: SessionListener, index: int, clock: int) -> None:
         """The server has said that a listener is there, from this clock of the session's on."""
@@ -501,8 +526,10 @@ class Session:
         listener.level = self.level
         listener.packets = _packet_reader(self.welcome)
 
-    def _put(self, message: Mapping[str, Any], key: object = None) -> None:
-        self.outbox.put(Outgoing(json.dumps(message), is_counted=message["type"] not in _UNCOUNTED), key)
+    def _put(self, message: Mapping[str, Any], key: object = None, emitter: SessionEmitter | None = None) -> None:
+        """Say something, about an emitter if one is given."""
+        about: Thing | None = None if emitter is None else ("emitter", emitter.id)
+        self.outbox.put(Outgoing(json.dumps(message), message["type"] not in _UNCOUNTED, about), key)
 
     def _new_pose(self, counts: ListenerStatistics, now_s: float) -> int:
         pose_id, self._next_pose_id = self._next_pose_id, self._next_pose_id + 1
@@ -574,6 +601,10 @@ class Session:
         match message:
             case {"type": "emitter_added", "id": identifier, "sample_clock": clock} if identifier in self.emitters:
                 emitter = self.emitters[identifier]
+                if emitter.is_over:  # the server goes by a snapshot from before it was heard, and begins it again
+                    emitter.has_ended = True
+                    self.remove_emitter(emitter)
+                    return message
                 emitter.is_heard, emitter.start_clock = True, clock
                 if emitter.live:
                     emitter.live.open()
@@ -582,7 +613,7 @@ class Session:
                 emitter = self.emitters[identifier]
                 emitter.has_ended = True
                 if message.get("removed"):
-                    del self.emitters[identifier]
+                    self._end(emitter)
                     self.outbox.end(("emitter", identifier))
             case {"type": "listener_added", "id": identifier, "index": index, "sample_clock": clock} if (
                 identifier in self.listeners

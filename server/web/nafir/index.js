@@ -188,7 +188,7 @@ class Listener extends Placed {
  * A stream in an AudioContext. Events: "state" (detail: {state, ...}; connecting, live, waiting, refused or closed), "refused" (detail: an
  * error of the server, after which the stream goes on), "level", "effects", "status" (details: those messages, with the id of a `listener`
  * beside the first), "ended" (detail: {id, removed} of an emitter all of whose clip has been heard, and that is removed if it was to be, or
- * if a new stream does not begin it again), "left" (detail: {id, code, message} of a listener whom a new connection may not have again).
+ * if another server does not begin it again), "left" (detail: {id, code, message} of a listener whom a new connection may not have again).
  */
 class Nafir extends EventTarget {
   #stream;
@@ -229,8 +229,9 @@ class Nafir extends EventTarget {
     stream.addEventListener("ended", ({ detail }) => {
       const known = this.#emitters.get(detail.id);
       if (!known) return; // removed meanwhile
-      known.emitter.hasEnded = true;
       if (detail.removed) this.#emitters.delete(detail.id);
+      if (known.emitter.hasEnded) return; // which has been said
+      known.emitter.hasEnded = true;
       this.dispatchEvent(new CustomEvent("ended", { detail: { id: detail.id, removed: detail.removed } }));
     });
     stream.addEventListener("joined", ({ detail }) => {

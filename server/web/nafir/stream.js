@@ -73,13 +73,15 @@ export class Stream {
   #clockOffset = 0; // what is added to the server's clock, which begins at 0 with each new stream
   #nextClock = 0; // of the frame after the first listener's newest block, and when that came
   #clockAt = 0;
-  #orders = []; // the newest messages that the server counts: {text, key, adds, isSent, isOver}, and how many there were
+  // The newest messages that the server counts: {text, key, emitter, adds, isSent, isOver}, and how many there were. `emitter` is the id of the
+  // one that it is about, or null, and `adds` says whether it adds that one.
+  #orders = [];
   #ordered = 0;
   #awaiting = new Map(); // key -> message that says what changed since the hello, for when the hello is answered
   #doors = null; // names of the scene's doors, once a welcome has said them
   #listener; // {position, at} and orientation or yaw
   #emitters = new Map(); // id -> {clip or live, position, gainDb, at} and what else add_emitter has
-  #heard = new Set(); // ids of emitters that the server has said are heard
+  #played = new Map(); // id -> {start, wasHeard, hasEnded} of emitters that the server has said are heard, from the clock start on, or over
   #dry = new Map(); // sequence of the next dry block of each live emitter that is heard
   #others = new Map(); // id -> listener beside the first: {position, orientation, head, at} and what `#entered` adds
   #dirty = new Set(); // "listener" and ids of emitters and other listeners that moved since they were last sent
@@ -91,8 +93,9 @@ export class Stream {
    * `hello` is what message.hello takes, but for listener and emitters; `listeners` are callbacks: block(block, id), state({state, ...}),
    * posed({poseId, at, listener}), status(message), level(message), effects(message), refused({code, message, field, retry_after_s}),
    * clock({sampleClock, at}), ended({id, removed}), joined({id}) and left({id, code, message}). `ended` says that all sound of an emitter's
-   * clip has been heard, and whether the emitter is removed for that. Clocks go on over lost connections. `id` and `listener` are those of a listener beside the first: `joined` says that its blocks
-   * begin, in each new stream, and `left` that it was refused, or was not there in time (its code is null then), and is not asked for again.
+   * clip has been heard, or that no more will be, and whether the emitter is removed for that; then it may say so a second time. Clocks go
+   * on over lost connections. `id` and `listener` are those of a listener beside the first: `joined` says that its blocks begin, in each new
+   * stream, and `left` that it was refused, or was not there in time (its code is null then), and is not asked for again.
    */
   constructor({ url, key = null, hello, listener, emitters, listeners }) {
     this.#url = url;
@@ -116,13 +119,13 @@ export class Stream {
     this.#emitters.set(id, emitter);
     if (!this.#isOpen) return;
     if (!known || known.clip !== clip) {
-      if (known) this.#order(message.removeEmitter(id));
-      this.#heard.delete(id);
+      if (known) this.#order(message.removeEmitter(id), { emitter: id });
+      this.#played.delete(id);
       this.#dry.delete(id);
       this.#endWriter(id);
       this.#add(emitter);
     } else if (known.gainDb !== gainDb) {
-      this.#order(message.setGain(emitter), `gain ${id}`);
+      this.#order(message.setGain(emitter), { key: `gain ${id}`, emitter: id });
     } else {
       this.#dirty.add(`emitter ${id}`);
       this.#schedule();
@@ -134,7 +137,7 @@ export class Stream {
     const emitter = this.#emitters.get(id);
     if (!emitter) return;
     this.#emitters.set(id, { ...emitter, loop: false }); // what was stopped is not begun again by a new stream
-    if (this.#isOpen) this.#order(message.stopEmitter({ id, stopAt: this.#serverClock(at), fadeS }));
+    if (this.#isOpen) this.#order(message.stopEmitter({ id, stopAt: this.#serverClock(at), fadeS }), { emitter: id });
   }
 
   /** Adds a listener beside the first, who hears the same emitters: {id, position, orientation, head, at}. */
@@ -210,7 +213,7 @@ export class Stream {
   }
 
   removeEmitter(id) {
-    if (this.#dropEmitter(id) && this.#isOpen) this.#order(message.removeEmitter(id));
+    if (this.#dropEmitter(id) && this.#isOpen) this.#order(message.removeEmitter(id), { emitter: id });
   }
 
   /** Forgets an emitter. Returns whether it was known. */
@@ -219,17 +222,28 @@ export class Stream {
     this.#endWriter(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
-    this.#heard.delete(id);
+    this.#played.delete(id);
     return this.#emitters.delete(id);
   }
 
+  /** The clip of an emitter is over. The server does not have the emitter any more if it is `removed`. */
   #ended({ id, removed }) {
+    if (!this.#emitters.has(id)) return;
+    const isNews = removed || !this.#played.get(id)?.hasEnded;
     if (removed) {
       this.#dropEmitter(id);
-      const added = this.#orders.findLast(({ adds }) => adds === id);
-      if (added) added.isOver = true; // so that it is not played again
+      this.#endOrders(id); // so that it is not played again
+    } else {
+      this.#played.set(id, { ...this.#played.get(id), hasEnded: true });
     }
-    this.#listeners.ended({ id, removed });
+    if (isNews) this.#listeners.ended({ id, removed });
+  }
+
+  /** The newest order that adds an emitter, and those about it after that, are not sent again. */
+  #endOrders(id) {
+    const added = this.#orders.findLastIndex(({ emitter, adds }) => adds && emitter === id);
+    if (added < 0) return;
+    for (const order of this.#orders.slice(added)) if (order.emitter === id) order.isOver = true;
   }
 
   setLevel(level) {
@@ -279,7 +293,7 @@ export class Stream {
     const { startAt, stopAt } = emitter;
     this.#missing.add(emitter.id);
     const clocks = { startAt: this.#serverClock(startAt), stopAt: this.#serverClock(stopAt) };
-    this.#order(message.addEmitter({ ...emitter, ...clocks }), null, emitter.id);
+    this.#order(message.addEmitter({ ...emitter, ...clocks }), { emitter: emitter.id, adds: true });
   }
 
   #serverClock(clock) {
@@ -354,19 +368,19 @@ export class Stream {
 
   /** Sends a message that changes what the hello says too. While a hello is not answered yet, the message waits. */
   #change(text, key = null) {
-    if (this.#isOpen) this.#order(text, key);
+    if (this.#isOpen) this.#order(text, { key });
     else this.#awaiting.set(key ?? text, text);
   }
 
   /** Sends a message that changes the stream, now or when it is resumed. One that waits for that gives way to a newer one with its key.
-      `adds` is the id of the emitter that it adds. */
-  #order(text, key = null, adds = null) {
+      `emitter` is the id of the one that it is about, and that it `adds` or changes. */
+  #order(text, { key = null, emitter = null, adds = false } = {}) {
     const older = key === null ? -1 : this.#orders.findIndex((order) => order.key === key && !order.isSent);
     if (older >= 0) {
       this.#orders.splice(older, 1);
       this.#ordered -= 1;
     }
-    this.#orders.push({ text, key, adds, isSent: this.#welcomed });
+    this.#orders.push({ text, key, emitter, adds, isSent: this.#welcomed, isOver: false });
     this.#ordered += 1;
     if (this.#orders.length > MOST_ORDERS) this.#orders.shift();
     if (this.#welcomed) this.#send(text);
@@ -383,10 +397,23 @@ export class Stream {
     for (const other of this.#others.values()) other.number = other.asked = null;
   }
 
-  /** What plays once and was heard is not begun again by a new stream. */
+  /** A connection was lost: notes which emitters were heard in the last block or before it. */
+  #noteHeard() {
+    for (const played of this.#played.values()) played.wasHeard ||= played.start < this.#nextClock;
+  }
+
+  /** Whether a server that does not have an emitter is not to begin it again: its clip has ended, or plays once and was heard. */
+  #isOver(id) {
+    const { wasHeard = false, hasEnded = false } = this.#played.get(id) ?? {};
+    const { live, loop = true } = this.#emitters.get(id);
+    return hasEnded || (wasHeard && !live && !loop);
+  }
+
+  /** What is over is not begun again by a new stream. */
   #endPlayed() {
-    for (const [id, { live, loop = true }] of this.#emitters) if (!live && !loop && this.#heard.has(id)) this.#ended({ id, removed: true });
-    this.#heard.clear();
+    this.#noteHeard();
+    for (const id of [...this.#emitters.keys()]) if (this.#isOver(id)) this.#ended({ id, removed: true });
+    this.#played.clear();
   }
 
   /** Leaves the connection with a close code. */
@@ -493,7 +520,7 @@ export class Stream {
     else if (received.type === "status") this.#listeners.status(received);
     else if (received.type === "level_changed") this.#listeners.level(received);
     else if (received.type === "plan_changed") this.#listeners.effects(received);
-    else if (received.type === "emitter_added") this.#added(received.id);
+    else if (received.type === "emitter_added") this.#added(received.id, received.sample_clock);
     else if (received.type === "emitter_ended") this.#ended(received);
     else if (received.type === "listener_added") this.#joined(received.id, received.index);
     else if (received.type === "snapshot") this.#keep(received);
@@ -523,10 +550,17 @@ export class Stream {
     this.#entered(id, number);
   }
 
-  #added(id) {
+  #added(id, clock) {
     this.#missing.delete(id);
-    if (this.#emitters.has(id)) this.#heard.add(id);
-    if (this.#emitters.get(id)?.live) this.#dry.set(id, 0);
+    if (!this.#emitters.has(id)) return;
+    if (this.#isOver(id)) {
+      // The server goes by a snapshot from before it was heard, and begins it again.
+      this.#ended({ id, removed: true });
+      this.#order(message.removeEmitter(id), { emitter: id });
+      return;
+    }
+    this.#played.set(id, { start: clock + this.#clockOffset, wasHeard: false, hasEnded: false });
+    if (this.#emitters.get(id).live) this.#dry.set(id, 0);
   }
 
   #welcome(welcome) {
@@ -555,7 +589,7 @@ export class Stream {
     } else {
       for (const id of this.#others.keys()) this.#askFor(id); // before what they are to hear from its beginning
       for (const emitter of this.#emitters.values()) this.#add(emitter);
-      for (const [key, text] of this.#awaiting) this.#order(text, key);
+      for (const [key, text] of this.#awaiting) this.#order(text, { key });
       this.#awaiting.clear();
     }
     // Everything that moved between hello and welcome is in here.
@@ -574,9 +608,14 @@ export class Stream {
     return this.#nextClock + blockSize * Math.max(0, Math.ceil(away / blockSize));
   }
 
-  /** Sends what the server had not got when the connection was lost, and where everything is now. */
+  /** Sends what the server had not got when the connection was lost, and where everything is now. What plays once and was heard since a
+      snapshot is not begun again. */
   #goOn({ handled, listeners = [] }) {
     const missed = Math.max(0, this.#ordered - handled);
+    this.#noteHeard();
+    for (const { emitter, adds } of this.#orders.slice(this.#orders.length - missed)) {
+      if (adds && this.#emitters.has(emitter) && this.#isOver(emitter)) this.#ended({ id: emitter, removed: true });
+    }
     const unhandled = this.#orders.splice(this.#orders.length - missed, missed);
     const lost = unhandled.filter(({ isOver }) => !isOver);
     this.#orders.push(...lost);
@@ -584,10 +623,10 @@ export class Stream {
     for (const order of lost) {
       this.#send(order.text);
       order.isSent = true;
-      if (!this.#emitters.has(order.adds)) continue;
-      this.#missing.add(order.adds); // though it may have been heard since the snapshot
-      this.#heard.delete(order.adds);
-      this.#dry.delete(order.adds);
+      if (!order.adds || !this.#emitters.has(order.emitter)) continue;
+      this.#missing.add(order.emitter); // though it may have been heard since the snapshot
+      this.#played.delete(order.emitter);
+      this.#dry.delete(order.emitter);
     }
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
     const numbers = new Map(listeners.map(({ id, index }) => [id, index]));
