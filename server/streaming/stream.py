@@ -181,9 +181,9 @@ class Stream:
         """When the first block since the start plays."""
         self._worst_lateness_s = 0.0
         self._worst_sent_s = 0.0
-        self._ir_interval_s = 0.0
         """The longest time from a block's due time until it was sent, since the last measurement; the sender writes
         it."""
+        self._ir_interval_s = 0.0
         self._next_check_s: float | None = FIRST_S
         """Seconds of sound at which the next check of a plan is due; None during a check."""
         self._next_status_s = 1.0

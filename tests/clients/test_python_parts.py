@@ -447,7 +447,9 @@ def test_clips_that_play_once_and_were_heard_are_not_played_again_when_their_ser
     assert set(session.emitters) == {"later", "loop"}
 
 
-def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent():
+def cut_off_from_a_shot():
+    """A session whose server was lost after a clip that plays once was heard, and that clip's emitter. The snapshot is
+    from before."""
     session = Session("flat", {})
     session.first_message()
     session.greet(resumable(), 0.0)
@@ -457,6 +459,11 @@ def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent():
     tell_added(session, "shot", 0)
     session.receive(wire_block(0, 0), 0.0)
     session.disconnect()
+    return session, shot
+
+
+def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent():
+    session, shot = cut_off_from_a_shot()
     session.set_gain(shot, -3.0, 0.0)
     session.move_emitter(shot, (2.0, 2.0, 1.0), None, 0.0)
     session.set_level("auto")
@@ -465,15 +472,7 @@ def test_what_is_said_in_an_outage_of_a_clip_that_is_over_is_not_sent():
 
 
 def test_a_clip_whose_id_is_given_again_in_an_outage_is_played():
-    session = Session("flat", {})
-    session.first_message()
-    session.greet(resumable(), 0.0)
-    session.receive(snapshot("sealed", 0), 0.0)
-    shot = add_clip(session, "shot", loop=False)
-    drained(session.outbox)
-    tell_added(session, "shot", 0)
-    session.receive(wire_block(0, 0), 0.0)
-    session.disconnect()
+    session, shot = cut_off_from_a_shot()
     session.remove_emitter(shot)
     again = add_clip(session, "shot", loop=False)
     lose_and_resume(session, 0, 5_000)
