@@ -139,7 +139,8 @@ def test_a_bundle_offers_the_optimal_levels_and_keeps_what_was_measured(frontier
 @pytest.mark.parametrize(("bus", "kept"), [(1, ["bus"]), (2, [])])
 def test_what_clients_hear_that_render_the_scene_is_kept_though_it_is_not_optimal(frontier, tmp_path, bus, kept):
     bundle = write_directional(tmp_path / "flat", order=2)
-    level = frontier.default.level.model_copy(update={"field": "directional"})
+    # Which point is the default follows from times. A field of directions takes no level with reuse or another phase.
+    level = frontier.default.level.model_copy(update={"field": "directional", "reuse": None, "phase": Phase()})
     default = replace(frontier.default, level=level)
     by_bus = replace(default, level=level.model_copy(update={"name": "bus", "bus": bus}))
     measured = replace(frontier, points=(default, by_bus), best=(default,), default=default, offered=(default,))
