@@ -6,6 +6,7 @@ import { pathToFileURL } from "node:url";
 
 const [, , modules, vectors] = process.argv;
 const load = (name) => import(new URL(name, `${pathToFileURL(modules)}/`));
+const { buffersOf } = await load("channels.js");
 const { parseBlock, serializeDryBlock, serializePose } = await load("wire.js");
 const { bind, orientationToThree, poseOf, positionToThree } = await load("three.js");
 const table = JSON.parse(readFileSync(vectors));
@@ -33,7 +34,8 @@ const { pose_id: poseId, position, orientation } = table.listener;
 const dry = table.dry_blocks.filter(({ encoding }) => encoding === "f32");
 const wet = table.audio_blocks.map(({ hex: text, encoding }) => {
   const block = parseBlock(bytes(text), encoding);
-  return { ...block, channels: block.channels.map((samples) => Array.from(samples)) };
+  const buffers = buffersOf(block.channels).length;
+  return { ...block, buffers, channels: block.channels.map((samples) => Array.from(samples)) };
 });
 const damaged = [];
 for (let size = 0; 2 * size < table.audio_blocks[0].hex.length; size++) {

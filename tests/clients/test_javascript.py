@@ -55,6 +55,7 @@ def test_audio_blocks_are_read_as_the_server_wrote_them(found):
         # A single channel is heard by both ears.
         wanted_channels = np.repeat(wanted["channels"], 2 if len(wanted["channels"]) == 1 else 1, axis=0)
         np.testing.assert_allclose(block["channels"], wanted_channels, atol=1e-7)
+        assert block["buffers"] == 1
     assert found["damaged"] == []
 
 

@@ -137,3 +137,21 @@ def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(one_page):
     run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": delays})
     assert run["underruns"][-1] == run["underruns"][len(run["underruns"]) // 4] <= 5
     assert run["steepest"] < 1.5 * STEEPEST_TONE
+
+
+RELEASE = """async () => {
+  const { buffersOf, newChannels, release } = await import("./nafir/channels.js");
+  const channels = newChannels(4, 512);
+  const { port1, port2 } = new MessageChannel();
+  const arrived = new Promise((resolve) => (port2.onmessage = ({ data }) => resolve(data)));
+  port1.postMessage(channels, buffersOf(channels));
+  const received = await arrived;
+  const lengths = received.map(({ length }) => length);
+  release(received);
+  return { left: channels[0].length, lengths, then: received.map(({ length }) => length) };
+}"""
+
+
+def test_channels_are_handed_on_and_freed_when_they_are_read(one_page):
+    """And not when the browser next looks for garbage, which would stop the audio thread."""
+    assert one_page.evaluate(RELEASE) == {"left": 0, "lengths": [512] * 4, "then": [0] * 4}

@@ -1,6 +1,7 @@
 // The worker of the stream. It passes commands from the page to a Stream, events back to the page, and audio blocks to the worklet of the
 // listener who hears them.
 
+import { buffersOf } from "./channels.js";
 import { Stream } from "./stream.js";
 
 let stream = null;
@@ -22,7 +23,7 @@ function open({ url, key, hello, listener, emitters, port }) {
     listener,
     emitters,
     listeners: {
-      block: (block, id) => ports.get(id)?.postMessage(block, block.channels.map((samples) => samples.buffer)),
+      block: (block, id) => ports.get(id)?.postMessage(block, buffersOf(block.channels)),
       state(detail) {
         // A new stream counts its samples and poses from zero. One that goes on does not.
         if (detail.state === "live") order = detail.welcome.order ?? null;

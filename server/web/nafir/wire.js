@@ -1,6 +1,8 @@
 // Wire format of /v1/stream, protocol version 3: parsers and serialisers side by side.
 // Units are metres and radians; everything binary is little endian.
 
+import { newChannels } from "./channels.js";
+
 export const PROTOCOL = 3;
 
 const AUDIO_BLOCK = 1;
@@ -100,7 +102,7 @@ export function parseBlock(buffer, encoding = "f32") {
   if (!CHANNELS.includes(count) || buffer.byteLength !== BLOCK_HEADER_BYTES + frames * count * bytes) {
     throw new TypeError(`audio block of ${buffer.byteLength} bytes for ${frames} frames, ${count} channels`);
   }
-  const channels = Array.from({ length: Math.max(2, count) }, () => new Float32Array(frames));
+  const channels = newChannels(Math.max(2, count), frames);
   channels.forEach((samples, index) => {
     let at = BLOCK_HEADER_BYTES + bytes * Math.min(index, count - 1);
     for (let frame = 0; frame < frames; frame++, at += bytes * count) {

@@ -3,6 +3,7 @@
 // page needs no cross-origin isolation.
 
 import { HeadDecoder } from "./ambisonics.js";
+import { release } from "./channels.js";
 import { JitterBuffer } from "./jitterbuffer.js";
 
 const QUANTUM = 128; // samples that the Web Audio API processes at once
@@ -48,7 +49,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     if (data.type === "connect") {
       this.feed?.close();
       this.feed = data.port;
-      this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : (this.next ?? this.present).buffer.push(block));
+      this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : this.#take(block));
     } else if (data.type === "end") {
       this.isOpen = false;
       this.feed?.close();
@@ -75,6 +76,11 @@ class NafirPlayer extends AudioWorkletProcessor {
     this.next = playing(order);
     this.next.decoder?.turn(this.orientation);
     if (this.filters) this.next.decoder?.use(this.filters.filters);
+  }
+
+  #take(block) {
+    (this.next ?? this.present).buffer.push(block);
+    release(block.channels);
   }
 
   /** Fills both ears. Returns the poses that become audible. */

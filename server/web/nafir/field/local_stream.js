@@ -1,6 +1,7 @@
 // A stream that no server renders: what Stream is for a server's, with blocks that are computed here, from a field in a worker beside it. It
 // does no I/O but messages to that worker, and reads its clock from outside, so that tests can drive it.
 
+import { newChannels } from "../channels.js";
 import { blockSizeAt } from "../wire.js";
 import { Convolver, DirectSound } from "./renderer.js";
 import { ClipSource, LiveSource } from "./sources.js";
@@ -122,15 +123,11 @@ export class LocalStream {
     this.#now = now;
     this.#sampleRate = hello.sampleRate;
     this.#block = blockSizeAt(hello.sampleRate);
-    this.#unheard = this.#newChannels();
+    this.#unheard = newChannels(CHANNELS, this.#block);
     this.#listener = listener;
     for (const emitter of emitters) this.#wanted.set(emitter.id, emitter);
     listeners.state({ state: "connecting", attempt: 0 });
     tell({ type: "open", server, key, scene: hello.scene, level: hello.level, sampleRate: hello.sampleRate, block: this.#block });
-  }
-
-  #newChannels() {
-    return Array.from({ length: CHANNELS }, () => new Float32Array(this.#block));
   }
 
   /** Takes a message of field_worker.js. */
@@ -311,7 +308,7 @@ export class LocalStream {
   }
 
   #render(late) {
-    const channels = this.#newChannels();
+    const channels = newChannels(CHANNELS, this.#block);
     const poses = { poseId: this.#heard("hasPath"), reverberationPoseId: this.#heard("hasResponse") };
     for (const emitter of this.#emitters.values()) this.#giveBack(emitter.process(channels));
     for (const emitter of this.#leaving) {

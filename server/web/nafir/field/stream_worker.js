@@ -1,6 +1,7 @@
 // The worker of a scene that is rendered in the browser. It takes the commands of ../stream_worker.js, passes events back, and gives audio
 // blocks to the worklet. The field computes in a worker of its own, so that a response never delays a block.
 
+import { buffersOf } from "../channels.js";
 import { LocalStream } from "./local_stream.js";
 
 const TICK_MS = 4;
@@ -29,7 +30,7 @@ function open({ server, key, hello, listener, emitters, port }) {
     now,
     tell: (message, transfer = []) => worker.postMessage(message, transfer),
     listeners: {
-      block: (block) => port.postMessage(block, block.channels.map((samples) => samples.buffer)),
+      block: (block) => port.postMessage(block, buffersOf(block.channels)),
       state(detail) {
         if (detail.state === "live") port.postMessage({ restart: true, order: detail.welcome.order });
         self.postMessage({ type: "state", detail });
