@@ -65,22 +65,8 @@ function resample({ signal, channels: count, from, to, into }) {
 function answerer(field, stream) {
   const block = blockSizeAt(field.sampleRate);
   return ({ type, id, poseId, listener, emitter }) => {
-    if (type === "open") {
-      const longestS = field.longestM / field.speedOfSound;
-      stream().receive({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS, ms: 1 });
-    }
+    if (type === "open") stream().receive({ type: "opened", level: field.level, manifest: field.manifest, samples: field.samples, ms: 1 });
     if (type !== "place") return;
-    try {
-      field.requireInside(listener, "listener");
-      field.requireInside(emitter, "emitter");
-    } catch (error) {
-      stream().receive({ type: "refused", id, message: error.message });
-      return;
-    }
-    const { lengthM, arrival: [x, y, z], gainDb } = field.directPath(listener, emitter);
-    const filter = field.directFilter({ lengthM, gainDb });
-    const delay = (lengthM / field.speedOfSound) * field.sampleRate;
-    stream().receive({ type: "path", id, poseId, path: { delay, filter, gains: [1, y, z, x] } });
     stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), block), ms: 1 });
   };
 }

@@ -28,6 +28,8 @@ export class Field {
   static load(server: string | URL, scene: string, options?: FieldOptions): Promise<Field>;
   /** Of what `load` fetches: scene.json, the ONNX file of the level's field, and the rows of the noises. */
   constructor(parts: { manifest: object; level?: string; sampleRate?: number; graph?: Uint8Array | null; noises?: readonly Float32Array[] | null });
+  /** scene.json. */
+  readonly manifest: object;
   readonly level: string;
   readonly sampleRate: number;
   /** Samples of a response. */

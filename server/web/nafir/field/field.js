@@ -11,10 +11,10 @@
 import { rotation } from "../ambisonics.js";
 import { apiOf, fetchBytes, fetchJson } from "../http.js";
 import { BandNoises } from "./band_noises.js";
-import { FloorPlan, OCTAVE_BANDS_HZ } from "./floor_plan.js";
+import { DirectPaths } from "./direct_paths.js";
+import { OCTAVE_BANDS_HZ } from "./floor_plan.js";
 import { Gate } from "./gate.js";
 import { Network } from "./network.js";
-import { absorptionDbPerM, PlaneWaves } from "./plane_waves.js";
 import { Resampler } from "./resampler.js";
 
 const EAR_AHEAD_S = 0.00026; // sound reaches the nearer ear at most this much before the middle of the head
@@ -30,13 +30,6 @@ const wallLossDb = (mass) =>
 
 const mirrorDb = ({ absorption, scattering }) =>
   absorption.map((absorbed, band) => 10 * Math.log10(Math.max(LEAST_POWER, (1 - absorbed) * (1 - scattering[band]))));
-
-function planOf({ id, geometry, mesh, bounds: { minimum, maximum } }) {
-  if (mesh) throw new Error(`scene ${id} is a triangle mesh, and only floor plans are computed in a browser`);
-  if (geometry) return new FloorPlan({ corners: geometry.corners, height: geometry.height_m });
-  const [[west, south, floor], [east, north, height]] = [minimum, maximum];
-  return new FloorPlan({ corners: [[west, south], [east, south], [east, north], [west, north]], height, floor });
-}
 
 /** The level of this name, or the first whose field knows directions. Throws Error if there is none. */
 function levelOf({ id, levels, fields, direct_sound: directSound }, name) {
@@ -58,13 +51,11 @@ export function readRows(bytes) {
 }
 
 export class Field {
-  #manifest;
-  #plan;
+  #direct;
   #network = null;
   #parameters;
   #reverberation = null;
   #gate = null;
-  #waves;
   #mirrorsDb = null;
   #wallLossDb = null;
   #knownHarmonics = 0;
@@ -97,18 +88,18 @@ export class Field {
     if (!Number.isInteger(sampleRate) || sampleRate < 1) throw new RangeError(`sampleRate: has to be a whole number of Hz, not ${sampleRate}`);
     const level = levelOf(manifest, name);
     const file = manifest.fields[level.field];
-    const { speed_of_sound: speedOfSound = 343, image_order: imageOrder = 0 } = manifest;
-    this.#manifest = manifest;
+    const { image_order: imageOrder = 0 } = manifest;
+    /** scene.json. */
+    this.manifest = manifest;
     this.level = level.name;
-    this.#plan = planOf(manifest);
+    this.#direct = new DirectPaths({ manifest, sampleRate });
     this.#parameters = file?.codec ?? manifest.codec;
-    this.speedOfSound = speedOfSound;
+    this.speedOfSound = this.#direct.speedOfSound;
     this.sampleRate = sampleRate;
     [this.#ownRate, this.#ownSamples] = [manifest.codec.sample_rate, manifest.codec.samples];
     if (sampleRate !== this.#ownRate) this.#resampler = new Resampler({ from: this.#ownRate, to: sampleRate, samples: this.#ownSamples });
     /** Samples of a response. */
     this.samples = this.#resampler?.samples ?? this.#ownSamples;
-    this.#waves = new PlaneWaves({ sampleRate: this.sampleRate, speedOfSound, airDbPerM: absorptionDbPerM(manifest.air) });
     if (imageOrder > 0) {
       const { walls, floor, ceiling } = manifest.geometry.materials;
       this.#mirrorsDb = { walls: mirrorDb(walls), floor: mirrorDb(floor), ceiling: mirrorDb(ceiling) };
@@ -126,29 +117,26 @@ export class Field {
 
   /** Throws RangeError for a position that is not inside the scene. */
   requireInside(position, name) {
-    const { minimum, maximum } = this.#manifest.bounds;
-    const isInBox = position.every((at, axis) => minimum[axis] <= at && at <= maximum[axis]);
-    if (position.length === 3 && isInBox && this.#plan.contains(position)) return;
-    throw new RangeError(`${name} (${position.join(", ")}) is not inside scene ${this.#manifest.id}`);
+    this.#direct.requireInside(position, name);
   }
 
   /** Where a visit of the scene begins: {listener, emitter}, two positions. */
   get start() {
-    const { bounds: { minimum, maximum }, start } = this.#manifest;
+    const { bounds: { minimum, maximum }, start } = this.manifest;
     const middle = minimum.map((low, axis) => (low + maximum[axis]) / 2);
     return { listener: start?.listener ?? middle, emitter: start?.emitter ?? middle };
   }
 
   /** The direct sound: {lengthM, arrival, gainDb}, the length of its path, the direction from the listener, and gains of edges per band. */
   directPath(listener, emitter) {
-    return this.#plan.path(listener, emitter, this.speedOfSound);
+    return this.#direct.between(listener, emitter);
   }
 
   /** The whole response, [W, Y, Z, X] in the axes of a head with this orientation (default: the world's). Throws RangeError as `requireInside`. */
   response(listener, emitter, orientation = null) {
     const path = this.directPath(listener, emitter);
     const channels = this.reflections(listener, emitter, path);
-    this.#waves.add(path, channels);
+    this.#direct.waves.add(path, channels);
     if (orientation) turn(channels, rotation(orientation, ORDER));
     return channels;
   }
@@ -159,27 +147,17 @@ export class Field {
     this.requireInside(emitter, "emitter");
     const channels = this.#network ? this.#late(listener, emitter, path) : Array.from({ length: CHANNELS }, () => new Float32Array(this.samples));
     if (this.#mirrorsDb) {
-      for (const { lengthM, arrival, surface } of this.#plan.reflections(listener, emitter)) {
-        this.#waves.add({ lengthM, arrival, gainDb: this.#mirrorsDb[surface] }, channels);
+      for (const { lengthM, arrival, surface } of this.#direct.plan.reflections(listener, emitter)) {
+        this.#direct.waves.add({ lengthM, arrival, gainDb: this.#mirrorsDb[surface] }, channels);
       }
     }
     if (this.#wallLossDb) this.#addThroughWalls(listener, emitter, channels);
     return channels;
   }
 
-  /** How many taps `directFilter` has. */
-  get filterTaps() {
-    return this.#waves.taps;
-  }
-
-  /** No direct path is longer than this: it passes no corner twice. */
-  get longestM() {
-    return this.#plan.longestM;
-  }
-
   /** The filter of the direct sound: minimum phase, with its gain by distance. */
   directFilter(path) {
-    return this.#waves.filter(path);
+    return this.#direct.waves.filter(path);
   }
 
   #late(listener, emitter, path) {
@@ -192,18 +170,18 @@ export class Field {
     if (!Number.isFinite(aligned)) throw new RangeError("no way leads from emitter to listener");
     const harmonics = directions?.data.subarray(0, this.#knownHarmonics * levels.data.length) ?? new Float32Array(0);
     const channels = this.#reverberation.decode({ logMagnitude: levels.data, directions: harmonics }, aligned, this.#ownSamples);
-    const echoS = this.#plan.firstEchoM(listener, emitter) / this.speedOfSound;
+    const echoS = this.#direct.plan.firstEchoM(listener, emitter) / this.speedOfSound;
     this.#gate.open(channels, Math.floor(aligned) + lead, Math.floor((echoS - EAR_AHEAD_S) * this.#ownRate));
     return this.#resampler?.resample(channels) ?? channels;
   }
 
   #addThroughWalls(listener, emitter, channels) {
-    const walls = this.#plan.wallsBetween(listener, emitter);
+    const walls = this.#direct.plan.wallsBetween(listener, emitter);
     if (walls === 0) return;
     const offset = emitter.map((at, axis) => at - listener[axis]);
     const lengthM = Math.hypot(...offset);
     const arrival = offset.map((along) => along / lengthM);
-    this.#waves.add({ lengthM, arrival, gainDb: this.#wallLossDb.map((loss) => -walls * loss) }, channels);
+    this.#direct.waves.add({ lengthM, arrival, gainDb: this.#wallLossDb.map((loss) => -walls * loss) }, channels);
   }
 }
 

@@ -1,5 +1,5 @@
-// The worker that computes responses for a scene that is rendered in the browser. It keeps the newest pose of each emitter alone, finds all
-// direct paths first, and then computes one response at a time.
+// The worker that computes responses for a scene that is rendered in the browser. It keeps the newest pose of each emitter alone, and computes
+// one response at a time.
 
 import { Field } from "./field.js";
 import { spectraOf } from "./renderer.js";
@@ -8,7 +8,7 @@ const WARM_UP = 6; // responses before the first that is heard: code that runs f
 
 let field = null;
 let quantum = 0;
-const placed = new Map(); // emitter id -> {listener, emitter, poseId, hasPath}; in the order in which responses are computed
+const placed = new Map(); // emitter id -> {listener, emitter, poseId}; in the order in which responses are computed
 const spare = []; // spectra to write into
 const { port1, port2 } = new MessageChannel();
 let isBusy = false;
@@ -17,11 +17,10 @@ async function open({ server, scene, level, key, sampleRate, block }) {
   try {
     field = await Field.load(server, scene, { level, sampleRate, key });
     quantum = block;
-    const longestS = field.longestM / field.speedOfSound;
     const { listener, emitter } = field.start;
     let ms = 0;
     for (let i = 0; i < WARM_UP; i++) ms = compute(listener, emitter).ms;
-    self.postMessage({ type: "opened", level: field.level, samples: field.samples, taps: field.filterTaps, longestS, ms });
+    self.postMessage({ type: "opened", level: field.level, manifest: field.manifest, samples: field.samples, ms });
   } catch ({ code = null, message, status }) {
     self.postMessage({ type: "failed", code, message, needsKey: status === 401 });
   }
@@ -29,19 +28,11 @@ async function open({ server, scene, level, key, sampleRate, block }) {
 
 /** Takes the newest poses of an emitter and of the listener. One that waits for a response keeps its turn. */
 function place({ id, ...pose }) {
-  placed.set(id, { ...pose, hasPath: false });
+  placed.set(id, pose);
   if (!isBusy) {
     isBusy = true;
     port2.postMessage(null);
   }
-}
-
-function pathOf({ listener, emitter }) {
-  field.requireInside(listener, "listener");
-  field.requireInside(emitter, "emitter");
-  const path = field.directPath(listener, emitter);
-  const [x, y, z] = path.arrival;
-  return { delay: (path.lengthM / field.speedOfSound) * field.sampleRate, filter: field.directFilter(path), gains: [1, y, z, x] };
 }
 
 function compute(listener, emitter) {
@@ -50,21 +41,7 @@ function compute(listener, emitter) {
   return { spectra, ms: performance.now() - start };
 }
 
-function refuse(id, error) {
-  placed.delete(id);
-  self.postMessage({ type: "refused", id, message: error.message });
-}
-
 port1.onmessage = () => {
-  for (const [id, pose] of placed) {
-    if (pose.hasPath) continue;
-    try {
-      self.postMessage({ type: "path", id, poseId: pose.poseId, path: pathOf(pose) });
-      pose.hasPath = true;
-    } catch (error) {
-      refuse(id, error);
-    }
-  }
   const [next] = placed;
   if (next) {
     const [id, { listener, emitter, poseId }] = next;
@@ -73,7 +50,7 @@ port1.onmessage = () => {
       const { spectra, ms } = compute(listener, emitter);
       self.postMessage({ type: "response", id, poseId, spectra, ms }, [spectra.buffer]);
     } catch (error) {
-      refuse(id, error);
+      self.postMessage({ type: "refused", id, message: error.message });
     }
   }
   // By a message to itself, so that poses that have arrived come first.

@@ -1,8 +1,10 @@
-// A stream that no server renders: what Stream is for a server's, with blocks that are computed here, from a field in a worker beside it. It
-// does no I/O but messages to that worker, and reads its clock from outside, so that tests can drive it.
+// A stream that no server renders: what Stream is for a server's, with blocks that are computed here, from a field in a worker beside it. Direct
+// sound does not wait for that worker: its path is found here. It does no I/O but messages to the worker, and reads its clock from outside, so
+// that tests can drive it.
 
 import { newChannels } from "../channels.js";
 import { blockSizeAt } from "../wire.js";
+import { DirectPaths } from "./direct_paths.js";
 import { Convolver, DirectSound } from "./renderer.js";
 import { ClipSource, LiveSource } from "./sources.js";
 
@@ -92,6 +94,7 @@ export class LocalStream {
   #sampleRate;
   #block; // samples of a block
   #shape = null; // of responses, once the field is there
+  #paths = null; // of direct sound, likewise
   #level = null; // its name, likewise
   #listener;
   #wanted = new Map(); // id -> what the page wants of an emitter
@@ -136,18 +139,22 @@ export class LocalStream {
     const emitter = this.#emitters.get(detail.id);
     if (handlers[type]) handlers[type](detail);
     else if (type === "response") this.#gotResponse(emitter, detail);
-    else if (type === "path" && emitter) {
-      emitter.follow(detail.path);
-      emitter.hasPath = detail.poseId;
-    } else if (type === "refused") {
-      if (emitter) emitter.hasPath = emitter.hasResponse = emitter.asked; // it stays where it was
-      this.#listeners.refused({ code: "position_out_of_bounds", message: detail.message, field: null, emitter: detail.id });
+    else if (type === "refused") {
+      if (emitter) emitter.hasResponse = emitter.asked; // its room stays what it was
+      this.#outOfBounds(detail);
     }
   }
 
-  #opened({ level, ms, ...shape }) {
+  #outOfBounds({ id, message }) {
+    this.#listeners.refused({ code: "position_out_of_bounds", message, field: null, emitter: id });
+  }
+
+  #opened({ level, manifest, samples, ms }) {
     this.#costs.push(ms);
-    this.#shape = { ...shape, sampleRate: this.#sampleRate, block: this.#block };
+    const sampleRate = this.#sampleRate;
+    this.#paths = new DirectPaths({ manifest, sampleRate });
+    const { plan, speedOfSound, waves } = this.#paths;
+    this.#shape = { samples, taps: waves.taps, longestS: plan.longestM / speedOfSound, sampleRate, block: this.#block };
     this.#level = level;
     this.#openedAt = this.#startedAt = this.#now();
     this.setListener({ ...this.#listener, at: this.#now() });
@@ -211,14 +218,24 @@ export class LocalStream {
     if (!this.#shape) return;
     this.#posed(listener.at);
     for (const [id, emitter] of this.#emitters) {
-      if (moved) this.#ask(id, emitter);
+      if (moved) this.#place(id, emitter);
     }
     this.#poseId += 1;
   }
 
-  #ask(id, emitter) {
-    emitter.asked = this.#poseId;
-    this.#tell({ type: "place", id, poseId: this.#poseId, listener: [...this.#listener.position], emitter: [...emitter.wanted.position] });
+  /** Moves the direct sound of an emitter, and asks for its response. Where a position is not inside the scene it stays as it was. */
+  #place(id, emitter) {
+    const poseId = this.#poseId;
+    const [listener, place] = [[...this.#listener.position], [...emitter.wanted.position]];
+    emitter.asked = emitter.hasPath = poseId;
+    try {
+      emitter.follow(this.#paths.heard(listener, place));
+    } catch (error) {
+      emitter.hasResponse = poseId;
+      this.#outOfBounds({ id, message: error.message });
+      return;
+    }
+    this.#tell({ type: "place", id, poseId, listener, emitter: place });
   }
 
   setEmitter(wanted) {
@@ -244,7 +261,7 @@ export class LocalStream {
     emitter.wanted = wanted;
     if (!moved) return;
     this.#posed(wanted.at);
-    this.#ask(id, emitter);
+    this.#place(id, emitter);
     this.#poseId += 1;
   }
 
