@@ -109,6 +109,7 @@ export class Panel {
     this.#find("buffer").textContent = Math.round(this.#fillMs);
     this.#find("buffer-note").textContent = started ? `aims for ${Math.round(1000 * targetS)} ms` : "filling";
     this.#find("dropouts").textContent = counters.underruns;
+    this.#find("stretched").textContent = counters.stretches;
     this.#find("late").textContent = Math.max(counters.late, this.#server.late);
     this.#find("skipped").textContent = Math.max(counters.gaps, this.#server.dropped);
     for (const id of ["dropouts", "late", "skipped"]) {

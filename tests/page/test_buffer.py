@@ -24,6 +24,7 @@ SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0, rate = 2
   const heard = [];
   const fills = [];
   const underruns = [];
+  const stretches = [];
   const targets = [];
   let sent = 0;
   let last = -Infinity;
@@ -47,6 +48,7 @@ SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0, rate = 2
     fills.push(buffer.fill / rate);
     targets.push(buffer.target / rate);
     underruns.push(buffer.counters.underruns);
+    stretches.push(buffer.counters.stretches);
   }
   let steepest = 0;
   for (let i = 1; i < played.length; i++) steepest = Math.max(steepest, Math.abs(played[i] - played[i - 1]));
@@ -56,7 +58,7 @@ SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0, rate = 2
     for (let at = 0; at < bytes.length; at += 8192) text += String.fromCharCode(...bytes.subarray(at, at + 8192));
     return btoa(text);
   };
-  const series = { played: played.slice(-3 * rate), heard: heard.flat(), fills, targets, underruns };
+  const series = { played: played.slice(-3 * rate), heard: heard.flat(), fills, targets, underruns, stretches };
   for (const name in series) series[name] = packed(series[name]);
   return { series, before: played.length - 3 * rate, counters: buffer.counters, steepest };
 }"""
@@ -136,6 +138,43 @@ def test_after_a_few_dropouts_the_buffer_outgrows_the_jitter(one_page):
     delays = [0.0] * 40 + [0.11] + [0.0] * 52
     run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": delays})
     assert run["underruns"][-1] == run["underruns"][len(run["underruns"]) // 4] <= 5
+    assert run["steepest"] < 1.5 * STEEPEST_TONE
+
+
+@RATES
+@pytest.mark.parametrize("stall_s", [0.02, 0.03, 0.04])
+def test_what_is_rarely_late_is_stretched_over_and_leaves_no_delay(one_page, stall_s, rate):
+    parameters = {"seconds": 58, "skew": 0, "delays": [], "stalls": {str(30 * 24_000 // 256): stall_s}, "rate": rate}
+    run = simulate(one_page, parameters)
+    assert run["counters"]["underruns"] == 0
+    assert 0 < run["counters"]["stretches"] <= 4
+    assert run["stretches"][round(29 * len(run["stretches"]) / 58)] == 0
+    assert run["steepest"] < 1.5 * STEEPEST_TONE * 24_000 / rate
+    before, after = (run["fills"][round(s * rate / 128) :][: rate // 128].mean() for s in (29, 56))
+    assert after < before + 0.008
+
+
+def test_a_late_block_in_twenty_seconds_does_not_lengthen_the_buffer(one_page):
+    delays = [0.0] * 1874 + [0.035]
+    run = simulate(one_page, {"seconds": 82, "skew": 0, "delays": delays})
+    assert run["counters"]["underruns"] == 0
+    assert run["counters"]["stretches"] > 0
+    assert np.median(run["fills"][round(60 * QUANTA_PER_S) :]) < 0.045
+
+
+def test_for_blocks_that_are_often_late_there_is_room_in_the_buffer(one_page):
+    """Stretched over are those alone that come before the buffer knows them."""
+    delays = [0.0] * 187 + [0.04]  # one in two seconds
+    run = simulate(one_page, {"seconds": 60, "skew": 0, "delays": delays})
+    assert run["counters"]["underruns"] == 0
+    assert run["stretches"][-1] == run["stretches"][len(run["stretches"]) // 2]
+    assert np.median(run["fills"][round(40 * QUANTA_PER_S) :]) > 0.045
+
+
+def test_a_long_silence_is_a_dropout_after_a_few_stretches(one_page):
+    run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": [], "stalls": {"2800": 0.3}})
+    assert run["counters"]["underruns"] == 1
+    assert run["counters"]["stretches"] <= 8  # four before it, and four where playing begins again
     assert run["steepest"] < 1.5 * STEEPEST_TONE
 
 

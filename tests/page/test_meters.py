@@ -11,7 +11,7 @@ pytestmark = visitor.needs_browser
 REPORT = """async (levels) => {
   const { Panel } = await import("./panel.js");
   const panel = new Panel(document);
-  const counters = { underruns: 0, late: 0, gaps: 0 };
+  const counters = { underruns: 0, stretches: 0, late: 0, gaps: 0 };
   const report = (level) =>
     panel.report({ fillS: 0.05, targetS: 0.05, started: true, counters, rms: [level, level], peak: [level, level] });
   const now = performance.now.bind(performance);
