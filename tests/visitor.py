@@ -170,7 +170,7 @@ open field has a coarser one."""
 
 
 def open_page(context, url: str):
-    """With coarse maps of loudness, and without ripples about sources, for which it paints sixty frames a second."""
+    """With coarse maps of loudness, and without ripples about sources."""
     page = context.new_page()
     page.set_default_timeout(WAIT_MS)
     page.emulate_media(reduced_motion="reduce")

@@ -4,11 +4,13 @@
 // metres or null).
 
 import { Doors, opennessTowards } from "./doors.js";
+import { inNextFrame } from "./frames.js";
 import { View } from "./paper.js";
 import { sourceColour } from "./palette.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const SLOP = 4; // pixels that a click may move
+const RIPPLE_MS = 2400; // from an emitter until it is gone
 
 function element(name, attributes = {}, ...children) {
   const node = document.createElementNS(SVG, name);
@@ -55,8 +57,9 @@ export class FloorPlan extends EventTarget {
     // Scrolling would end a drag.
     const grabbed = (event) => event.target.closest("[data-drag]") && event.preventDefault();
     svg.addEventListener("touchstart", grabbed, { passive: false });
-    world.addEventListener("listener", () => this.#placeListener());
-    world.addEventListener("emitter", ({ detail }) => this.#placeEmitter(detail));
+    // What is dragged is at the pointer at once.
+    world.addEventListener("listener", () => (this.#drag ? this.#placeListener() : inNextFrame(this.#placeListener)));
+    world.addEventListener("emitter", ({ detail }) => (this.#drag ? this.#placeEmitter(detail) : inNextFrame(this.#syncEmitters)));
     world.addEventListener("emitters", () => this.#syncEmitters());
     new ResizeObserver(() => this.#resize()).observe(svg.parentElement);
     this.#resize();
@@ -70,6 +73,13 @@ export class FloorPlan extends EventTarget {
   glow(left, right) {
     this.#ears[0].style.setProperty("--level", left.toFixed(2));
     this.#ears[1].style.setProperty("--level", right.toFixed(2));
+  }
+
+  /** Shows the two ripples about each emitter as far as they have spread by now. */
+  ripple() {
+    const spread = performance.now() / RIPPLE_MS;
+    this.#emitterLayer.style.setProperty("--spread", (spread % 1).toFixed(3));
+    this.#emitterLayer.style.setProperty("--second-spread", ((spread + 0.5) % 1).toFixed(3));
   }
 
   #emit(type, detail) {
@@ -152,7 +162,7 @@ export class FloorPlan extends EventTarget {
     return group;
   }
 
-  #syncEmitters() {
+  #syncEmitters = () => {
     const { emitters } = this.#world;
     for (const [id, mark] of this.#emitterMarks) {
       if (emitters.has(id)) continue;
@@ -167,9 +177,9 @@ export class FloorPlan extends EventTarget {
       }
       this.#placeEmitter(emitter);
     }
-  }
+  };
 
-  #placeListener() {
+  #placeListener = () => {
     const { position, yaw } = this.#world.listener;
     const [x, y] = this.#view.toScreen(position);
     this.#listener.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
@@ -177,7 +187,7 @@ export class FloorPlan extends EventTarget {
     const heading = (Math.round(degrees(yaw)) + 360) % 360;
     this.#listener.setAttribute("aria-valuenow", heading);
     this.#listener.setAttribute("aria-valuetext", `${position[0].toFixed(1)}, ${position[1].toFixed(1)} metres, facing ${heading} degrees`);
-  }
+  };
 
   #placeEmitter({ id, position }) {
     const [x, y] = this.#view.toScreen(position);

@@ -4,6 +4,7 @@
 import { Comparison } from "./comparison.js";
 import { askForKey, key } from "./access.js";
 import { FloorPlan } from "./floorplan.js";
+import { inNextFrame } from "./frames.js";
 import { Effects } from "./effects.js";
 import { Frontier, HERE } from "./frontier.js";
 import { LocalWorkerStream } from "./nafir/field/local_worker_stream.js";
@@ -216,7 +217,7 @@ class Page {
     world.addEventListener("listener", () => {
       this.#turnHead();
       this.#tell("listener", this.#listenerNow());
-      this.#pointNeedle();
+      inNextFrame(this.#pointNeedle);
     });
     world.addEventListener("emitter", ({ detail }) => {
       this.#say(detail);
@@ -240,7 +241,7 @@ class Page {
     plan.addEventListener("dropped", () => this.map());
     plan.addEventListener("hover", ({ detail }) => {
       this.hovered = detail;
-      this.#pointNeedle();
+      inNextFrame(this.#pointNeedle);
     });
   }
 
@@ -248,8 +249,8 @@ class Page {
     this.player.addEventListener("report", ({ detail }) => {
       if (!this.playing || this.connection !== "live") return;
       this.steady = detail.playing;
-      const lengths = this.panel.report(detail, this.ledger.summary(), this.reverberationLedger.summary(), this.turnLedger.summary());
-      if (lengths) this.plan.glow(...lengths);
+      this.panel.report(detail, { direct: this.ledger, reverberation: this.reverberationLedger, turn: this.turnLedger });
+      inNextFrame(this.#drawLevels);
       if (this.output === "ambisonics" && epochNow() - this.turnedAt >= REST_MS) this.#turnHead();
     });
     this.player.addEventListener("turned", ({ detail }) => {
@@ -833,12 +834,18 @@ class Page {
     return grid;
   }
 
-  #pointNeedle() {
+  #pointNeedle = () => {
     if (!this.field) return;
     const hovered = this.hovered && this.field.at(this.hovered);
     if (Number.isFinite(hovered)) this.legend.point(hovered, "here");
     else this.legend.point(this.field.at(this.world.listener.position), "at you");
-  }
+  };
+
+  #drawLevels = () => {
+    if (!this.playing) return;
+    this.plan.glow(...this.panel.draw());
+    this.plan.ripple();
+  };
 }
 
 const page = new Page();

@@ -3,8 +3,7 @@
 import { Sparkline } from "./sparkline.js";
 
 const FLOOR_DB = -60;
-const DRAW_MS = 100; // interval of figures and strip chart
-const METER_MS = 40; // interval of the meters: whatever moves, the browser paints a whole frame, and reports come seventy times a second
+const PRINT_MS = 100; // interval of figures and strip chart
 const decibels = (amplitude) => (amplitude > 0 ? 20 * Math.log10(amplitude) : -Infinity);
 const fraction = (level) => Math.min(1, Math.max(0, 1 - level / FLOOR_DB));
 const milliseconds = (value) => `${Math.round(value)} ms`;
@@ -32,7 +31,7 @@ class Meter {
   /** Returns the bar's length, 0 to 1. */
   draw() {
     this.#bar.style.transform = `scaleX(${fraction(this.#shown).toFixed(4)})`;
-    this.#peak.style.left = `${(100 * fraction(this.#peakHold)).toFixed(2)}%`;
+    this.#peak.style.transform = `translateX(${(100 * fraction(this.#peakHold)).toFixed(2)}%)`;
     return fraction(this.#shown);
   }
 
@@ -52,8 +51,8 @@ export class Panel {
   #left;
   #right;
   #spark;
-  #drawn = 0;
-  #metersDrawn = 0;
+  #printed = 0;
+  #newest = null; // report and ledgers that are not printed yet
   #dropouts = 0;
   #fillMs = null;
   #turnsHere = false;
@@ -82,9 +81,8 @@ export class Panel {
     this.#find("part-server-name").textContent = isHere ? "This browser" : "Server and network";
   }
 
-  /** Shows a worklet report and the latencies of direct sound, reflected field and turns. Returns the meters' lengths for both ears
-   * where they are drawn anew, else null. */
-  report(report, latency, reverberation, turn) {
+  /** Takes a worklet report, to be drawn with the latencies of `ledgers`, {direct, reverberation, turn}, of that time. */
+  report(report, ledgers) {
     const at = performance.now();
     const fillMs = 1000 * report.fillS;
     this.#fillMs = this.#fillMs === null ? fillMs : this.#fillMs + 0.1 * (fillMs - this.#fillMs);
@@ -93,16 +91,24 @@ export class Panel {
     this.#spark.add({ at, value: fillMs, target: 1000 * report.targetS, dropout });
     this.#left.hear(report.rms[0], report.peak[0]);
     this.#right.hear(report.rms[1], report.peak[1]);
-    if (at - this.#drawn >= DRAW_MS) {
-      this.#drawn = at;
-      this.#print(report, latency, reverberation, turn);
+    this.#newest = [report, ledgers];
+  }
+
+  /** Draws what the reports said. Returns the lengths of the meters of both ears, 0 to 1. */
+  draw() {
+    const at = performance.now();
+    if (this.#newest !== null && at - this.#printed >= PRINT_MS) {
+      this.#print(...this.#newest);
+      this.#printed = at;
+      this.#newest = null;
     }
-    if (at - this.#metersDrawn < METER_MS) return null;
-    this.#metersDrawn = at;
     return [this.#left.draw(), this.#right.draw()];
   }
 
-  #print({ targetS, counters, started }, latency, reverberation, turn) {
+  #print({ targetS, counters, started }, ledgers) {
+    const latency = ledgers.direct.summary();
+    const reverberation = ledgers.reverberation.summary();
+    const turn = ledgers.turn.summary();
     this.#left.print();
     this.#right.print();
     this.#spark.draw();
@@ -142,6 +148,7 @@ export class Panel {
   }
 
   rest() {
+    this.#newest = null;
     this.#left.rest();
     this.#right.rest();
     this.#fillMs = null;

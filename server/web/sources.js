@@ -1,5 +1,6 @@
 // The list of emitters beside the floor plan: clip, gain and direction from the listener of each, with controls to add and remove one.
 
+import { inNextFrame } from "./frames.js";
 import { isVisible } from "./geometry.js";
 import { sourceColour } from "./palette.js";
 import { GAIN_DB } from "./world.js";
@@ -41,8 +42,8 @@ export class Sources {
     };
     world.addEventListener("emitters", () => this.#sync());
     world.addEventListener("limit", () => this.#sync());
-    world.addEventListener("emitter", () => this.#describe());
-    world.addEventListener("listener", () => this.#describe());
+    world.addEventListener("emitter", () => inNextFrame(this.#describe));
+    world.addEventListener("listener", () => inNextFrame(this.#tellPlaces));
     list.replaceChildren();
     this.#sync();
   }
@@ -140,13 +141,23 @@ export class Sources {
     this.#describe();
   }
 
-  #describe() {
+  /** Says where each emitter is from the listener. */
+  #tellPlaces = () => {
     const { listener, emitters, scene } = this.#world;
-    for (const [id, { place, select, gain }] of this.#rows) {
+    for (const [id, { place }] of this.#rows) {
       const emitter = emitters.get(id);
       if (!emitter) continue;
-      const visible = isVisible(scene.corners, listener.position, emitter.position);
-      place.textContent = describe(this.#world.bearing(emitter), visible);
+      const text = describe(this.#world.bearing(emitter), isVisible(scene.corners, listener.position, emitter.position));
+      if (place.textContent !== text) place.textContent = text; // even the same text costs a layout
+    }
+  };
+
+  #describe = () => {
+    this.#tellPlaces();
+    const { emitters } = this.#world;
+    for (const [id, { select, gain }] of this.#rows) {
+      const emitter = emitters.get(id);
+      if (!emitter) continue;
       select.value = emitter.clip;
       gain.value = emitter.gainDb;
       gain.title = `${emitter.gainDb > 0 ? "+" : ""}${emitter.gainDb} dB`;
@@ -154,5 +165,5 @@ export class Sources {
       const clip = this.#clips.find(({ name }) => name === emitter.clip);
       select.title = [clip?.title, clip?.credit].filter(Boolean).join(". ");
     }
-  }
+  };
 }
