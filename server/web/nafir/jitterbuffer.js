@@ -139,7 +139,7 @@ export class JitterBuffer {
     this.windowLeft -= frames;
     const stretch = this.fill < LEAST ? this.#stretch() : 0;
     const lag = stretch || (this.windowLeft <= 0 ? this.#correction() : 0);
-    if (lag !== 0 && frames === QUANTUM) this.#splice(outputs, lag);
+    if (lag !== 0) this.#splice(outputs, lag);
     else this.#copy(outputs, frames);
     if (stretch) this.added -= stretch;
     else if (lag !== 0) this.#openWindow(AGAIN_S);
@@ -216,7 +216,7 @@ export class JitterBuffer {
 
   /** How far the fill usually falls below its mean, in seconds. */
   get jitterS() {
-    return this.falls.toSorted((a, b) => a - b)[Math.floor(USUAL * (this.falls.length - 1) + 0.5)] ?? 0;
+    return [...this.falls].sort((a, b) => a - b)[Math.floor(USUAL * (this.falls.length - 1) + 0.5)] ?? 0;
   }
 
   #remember() {
