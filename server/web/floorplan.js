@@ -11,6 +11,7 @@ import { sourceColour } from "./palette.js";
 const SVG = "http://www.w3.org/2000/svg";
 const SLOP = 4; // pixels that a click may move
 const RIPPLE_MS = 2400; // from an emitter until it is gone
+const STILL = matchMedia("(prefers-reduced-motion: reduce)");
 
 function element(name, attributes = {}, ...children) {
   const node = document.createElementNS(SVG, name);
@@ -77,6 +78,7 @@ export class FloorPlan extends EventTarget {
 
   /** Shows the two ripples about each emitter as far as they have spread by now. */
   ripple() {
+    if (STILL.matches) return;
     const spread = performance.now() / RIPPLE_MS;
     this.#emitterLayer.style.setProperty("--spread", (spread % 1).toFixed(3));
     this.#emitterLayer.style.setProperty("--second-spread", ((spread + 0.5) % 1).toFixed(3));

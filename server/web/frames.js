@@ -1,5 +1,5 @@
 // Draws what has changed, all of it at once and at most thirty times a second. A frame costs about the same however much of it moves, and
-// where no graphics card paints it, it takes its time from the sound.
+// where no graphics card paints it, it takes its time from the sound. What is dragged is drawn elsewhere, at once.
 
 const LEAST_MS = 30; // between two frames: on a screen of sixty frames a second that leaves out every other one
 
@@ -20,5 +20,11 @@ function drawAll() {
   isAsked = false;
   const draws = [...waiting];
   waiting.clear();
-  for (const draw of draws) draw();
+  for (const draw of draws) {
+    try {
+      draw();
+    } catch (error) {
+      reportError(error); // the others are drawn all the same
+    }
+  }
 }

@@ -61,13 +61,15 @@ function resample({ signal, channels: count, from, to, into }) {
   return { samples: resampler.samples };
 }
 
-/** A field_worker.js that answers at once. */
-function answerer(field, stream) {
+/** A field_worker.js that answers at once, or once `hold` is null again. */
+function answerer(field, stream, hold) {
   const block = blockSizeAt(field.sampleRate);
   return ({ type, id, poseId, listener, emitter }) => {
     if (type === "open") stream().receive({ type: "opened", level: field.level, manifest: field.manifest, samples: field.samples, ms: 1 });
     if (type !== "place") return;
-    stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), block), ms: 1 });
+    const respond = () => stream().receive({ type: "response", id, poseId, spectra: spectraOf(field.reflections(listener, emitter), block), ms: 1 });
+    if (hold.responses) hold.responses.push(respond);
+    else respond();
   };
 }
 
@@ -86,14 +88,17 @@ function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
     return process.apply(this, given);
   };
   function obey(commands) {
-    for (const { listener: moved, emitter, remove, feed, wait } of commands) {
+    for (const { listener: moved, emitter, remove, feed, wait, hold: holds } of commands) {
+      if (holds) hold.responses = [];
       if (moved) local.setListener({ ...moved, at: time });
       if (emitter) local.setEmitter({ ...emitter, at: time });
       if (remove) local.removeEmitter(remove);
       if (feed) local.feed(feed.id, Float32Array.from(feed.samples));
       if (wait) time += wait;
+      if (holds === false) for (const respond of hold.responses.splice(0)) respond();
     }
   }
+  const hold = { responses: null };
   let rendered = 0;
   const block = ({ channels, poseId, reverberationPoseId, late }) => {
     told.heard.push([poseId, reverberationPoseId, late]);
@@ -107,7 +112,7 @@ function stream({ blocks, script, clip, soundAfter = 0, into, ...opened }) {
   const listeners = { block, posed: keep("posed"), refused: keep("refused"), state: keep("state"), status: keep("status") };
   let local = null;
   const waiting = [];
-  const answer = answerer(field, () => local);
+  const answer = answerer(field, () => local, hold);
   const { listener } = script[0][0];
   const hello = { scene: "any", sampleRate: field.sampleRate };
   local = new LocalStream({

@@ -570,6 +570,19 @@ def test_what_a_stream_refuses_is_said_and_it_goes_on(render):
     assert found.said["heard"][-1][0] == found.said["posed"][-1]["poseId"]
 
 
+def test_a_response_that_comes_after_a_newer_pose_was_refused_leaves_that_pose_answered(render):
+    here, there, source = HERE_AND_THERE
+    wall = (4.1, 1.0, 1.5)
+    script = {
+        0: [standing(here), radio(source)],
+        20: [{"hold": True}, standing(there), standing(wall)],
+        25: [{"hold": False}],
+    }
+    found = render(40, script, np.full(256, 0.1))
+    assert found.said["refused"][0]["code"] == "position_out_of_bounds"
+    assert found.said["heard"][-1][1] == found.said["posed"][-1]["poseId"]
+
+
 def test_blocks_that_are_much_too_late_are_left_out(render):
     here, _, source = HERE_AND_THERE
     script = {0: [standing(here), radio(source)], 20: [{"wait": 50}], 40: [{"wait": 5000}]}

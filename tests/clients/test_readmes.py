@@ -134,10 +134,9 @@ def test_javascript(bundle, hrtfs, tmp_path):
             page.goto(f"{url}?server=http://{address}&scene=flat")
             page.click("#start")
             page.wait_for_function("window.example?.nafir.latency.direct")
-            page.wait_for_timeout(1_000)
-            loudest = page.evaluate("""async () => {
+            # Speech begins softly.
+            page.wait_for_function("""async () => {
               const { left, right } = await example.nafir.capture(1);
-              return [left, right].map((ear) => ear.reduce((most, sample) => Math.max(most, Math.abs(sample)), 0));
+              return [left, right].every((ear) => ear.some((sample) => Math.abs(sample) > 0.01));
             }""")
             browser.close()
-    assert min(loudest) > 1e-3

@@ -1,5 +1,5 @@
 """What the player's buffer promises, on a simulated clock: blocks of 256 come in, quanta of 128 go out, at 24 kHz, or
-blocks of 512 at 48 kHz."""
+blocks of 512 at 44.1 and 48 kHz."""
 
 import base64
 import math
@@ -17,7 +17,7 @@ pytestmark = visitor.needs_browser
 
 SIMULATE = """async ({ seconds, skew, delays, stalls = {}, spacing = 0, rate = 24_000 }) => {
   const { JitterBuffer } = await import(new URL("nafir/jitterbuffer.js", document.baseURI));
-  const size = (256 * rate) / 24_000;
+  const size = rate === 24_000 ? 256 : 512;
   const buffer = new JitterBuffer({ sampleRate: rate });
   const tone = (n) => 0.5 * Math.sin((2 * Math.PI * 220 * n) / rate);
   const played = [];
@@ -76,7 +76,7 @@ def tone(samples: np.ndarray, rate: int) -> np.ndarray:
 
 
 STEEPEST_TONE = 0.5 * 2 * math.pi * 220 / 24_000
-RATES = pytest.mark.parametrize("rate", [24_000, 48_000])
+RATES = pytest.mark.parametrize("rate", [24_000, 44_100, 48_000])
 
 
 SETTLED_S = 25
@@ -87,7 +87,7 @@ QUANTA_PER_S = 24_000 / 128
 @RATES
 def test_on_a_steady_network_the_buffer_plays_every_sample_unchanged_once_it_has_settled(one_page, rate):
     run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": [], "rate": rate})
-    size = 256 * rate // 24_000
+    size = 256 if rate == 24_000 else 512
     assert run["counters"]["underruns"] == 0
     assert run["counters"]["splices"] > 0
     assert run["steepest"] < 1.5 * STEEPEST_TONE * 24_000 / rate
@@ -130,6 +130,7 @@ def test_clock_drift_is_absorbed_without_dropouts_or_clicks(one_page, skew, rate
     run = simulate(one_page, {"seconds": 50, "skew": skew, "delays": [], "rate": rate})
     assert run["counters"]["underruns"] == run["counters"]["gaps"] == run["counters"]["overflows"] == 0
     assert run["counters"]["splices"] > 0
+    assert run["counters"]["stretches"] == 0  # nothing is late
     assert max(run["fills"][-2000:]) < 0.1
     assert run["steepest"] < 1.5 * STEEPEST_TONE * 24_000 / rate
 
@@ -174,7 +175,7 @@ def test_for_blocks_that_are_often_late_there_is_room_in_the_buffer(one_page):
 def test_a_long_silence_is_a_dropout_after_a_few_stretches(one_page):
     run = simulate(one_page, {"seconds": 40, "skew": 0, "delays": [], "stalls": {"2800": 0.3}})
     assert run["counters"]["underruns"] == 1
-    assert run["counters"]["stretches"] <= 8  # four before it, and four where playing begins again
+    assert 4 <= run["counters"]["stretches"] <= 8  # four before it, and four where playing begins again
     assert run["steepest"] < 1.5 * STEEPEST_TONE
 
 

@@ -32,7 +32,7 @@ const GIVEN_BACK_S = 0.0002; // so one stretch in ten seconds is taken
 const MOST_STRETCHES = 4; // without a block in between: more would buzz, and a dropout is told
 const SHORTEST_LAG_S = 0.002; // of a splice
 const LONGEST_LAG_S = 0.012; // a period of the deepest voices, at every rate
-const COARSE_HZ = 24_000; // signals are compared at about this rate
+const COARSE_HZ = 24_000; // lags are tried that are a sample of about this rate apart
 const ALIKE = 0.02; // signals that differ by this share of their power or less, -17 dB, match: any of those lags will do
 const INAUDIBLE = 1e-4; // sum of squares over a quantum of the first two channels, 60 dB below full scale
 
@@ -193,7 +193,8 @@ export class JitterBuffer {
     this.#adapt();
     this.#openWindow();
     const headroom = this.headroomS * this.sampleRate;
-    if (this.#lowLately < Math.max(headroom / 2, LEAST)) return this.#bestLag(-1, headroom);
+    // A quantum before it is low enough to be stretched, so that a clock that differs is no late block.
+    if (this.#lowLately < Math.max(headroom / 2, LEAST + QUANTUM)) return this.#bestLag(-1, headroom);
     if (lowest > headroom + JUMP_S * this.sampleRate) return Math.round((lowest - headroom) / 2);
     const slack = SLACK_S * this.sampleRate;
     const recent = this.#lowestOf(SOON_S) - headroom;
@@ -256,20 +257,20 @@ export class JitterBuffer {
     const differences = [];
     let power = 0;
     const shortest = Math.round(SHORTEST_LAG_S * this.sampleRate);
-    const step = Math.max(1, Math.floor(this.sampleRate / COARSE_HZ)); // so that it costs the same at every rate
+    const step = Math.max(1, Math.round(this.sampleRate / COARSE_HZ)); // so that it costs about the same at every rate
     for (let lag = shortest; lag <= Math.min(LONGEST_LAG_S * this.sampleRate, limit); lag += step) {
       const shift = sign * lag;
       if (shift > 0 && this.fill < QUANTUM + shift + RESERVE) break;
       if (shift < 0 && this.read + shift < 0) break;
       let difference = 0;
-      for (let i = 0; i < QUANTUM; i += 2 * step) {
+      for (let i = 0; i < QUANTUM; i += 2) {
         const here = (this.read + i) % this.capacity;
         const there = (this.read + i + shift) % this.capacity;
         difference += (first[here] - first[there]) ** 2 + (second[here] - second[there]) ** 2;
       }
       differences.push(difference);
     }
-    for (let i = 0; i < QUANTUM; i += 2 * step) {
+    for (let i = 0; i < QUANTUM; i += 2) {
       const here = (this.read + i) % this.capacity;
       power += first[here] ** 2 + second[here] ** 2;
     }

@@ -1,6 +1,8 @@
 // Blocks in Opus, decoded by WebCodecs, and live sound on its way up, encoded by it. The browser does so when it likes, so what goes in
 // comes out a little later, in order.
 
+import { newChannels } from "./channels.js";
+
 const RATE = 48_000; // at which browsers decode Opus, whatever it was made from
 const MICROSECONDS = 1e6;
 const MOST_WAITING_S = 0.5; // of live sound that is not encoded yet; what comes then is dropped
@@ -110,8 +112,10 @@ export class OpusReader {
     while (this.#queue.length > 0 && this.#queue[0].missing === 0) {
       const { block, parts, dropped } = this.#queue.shift();
       const planesOf = (stream, plane) => joined(parts[stream].map((planes) => planes[plane]), dropped);
-      const channels = this.#streams.flatMap((count, stream) => Array.from({ length: count }, (_, plane) => planesOf(stream, plane)));
-      if (channels.length === 1) channels.push(channels[0].slice()); // a single channel is heard by both ears
+      const planes = this.#streams.flatMap((count, stream) => Array.from({ length: count }, (_, plane) => planesOf(stream, plane)));
+      if (planes.length === 1) planes.push(planes[0]); // a single channel is heard by both ears
+      const channels = newChannels(planes.length, planes[0].length);
+      planes.forEach((samples, channel) => channels[channel].set(samples));
       this.#deliver({ ...block, channels });
     }
   }

@@ -49,6 +49,7 @@ class NafirPlayer extends AudioWorkletProcessor {
     if (data.type === "connect") {
       this.feed?.close();
       this.feed = data.port;
+      this.present.buffer.isEnding = this.present.buffer.started; // what is left of it came through another port
       this.feed.onmessage = ({ data: block }) => (block.restart ? this.#restart(block.order) : this.#take(block));
     } else if (data.type === "end") {
       this.isOpen = false;

@@ -32,7 +32,6 @@ class LocalEmitter {
   #amplitude = null; // null before the first block
   wanted = {}; // what the page wants of it
   asked = -1; // newest pose for which the field was asked
-  hasPath = -1;
   hasResponse = -1;
   ending = null; // blocks that are left to ring; null while it plays
 
@@ -200,7 +199,7 @@ export class LocalStream {
     if (this.#costs.length > MEASURED) this.#costs.shift();
     const unused = emitter ? emitter.exchange(spectra) : spectra;
     this.#giveBack(unused);
-    if (emitter) emitter.hasResponse = poseId;
+    if (emitter) emitter.hasResponse = Math.max(emitter.hasResponse, poseId); // a newer pose may have been refused meanwhile
   }
 
   #giveBack(spectra) {
@@ -227,7 +226,7 @@ export class LocalStream {
   #place(id, emitter) {
     const poseId = this.#poseId;
     const [listener, place] = [[...this.#listener.position], [...emitter.wanted.position]];
-    emitter.asked = emitter.hasPath = poseId;
+    emitter.asked = poseId;
     try {
       emitter.follow(this.#paths.heard(listener, place));
     } catch (error) {
@@ -326,7 +325,7 @@ export class LocalStream {
 
   #render(late) {
     const channels = newChannels(CHANNELS, this.#block);
-    const poses = { poseId: this.#heard("hasPath"), reverberationPoseId: this.#heard("hasResponse") };
+    const poses = { poseId: this.#newestPose, reverberationPoseId: this.#newestAnswered };
     for (const emitter of this.#emitters.values()) this.#giveBack(emitter.process(channels));
     for (const emitter of this.#leaving) {
       this.#giveBack(emitter.process(channels));
@@ -342,10 +341,14 @@ export class LocalStream {
     return { ...poses, channels, sequence, sampleClock: sequence * this.#block, frames: this.#block, flags: 0, late };
   }
 
-  /** The newest pose with which everything is heard. */
-  #heard(has) {
-    let newest = Math.max(0, this.#poseId - 1);
-    for (const emitter of this.#emitters.values()) if (emitter[has] < emitter.asked) newest = Math.min(newest, Math.max(0, emitter[has]));
+  get #newestPose() {
+    return Math.max(0, this.#poseId - 1);
+  }
+
+  /** The newest pose with which every room's answer is heard. */
+  get #newestAnswered() {
+    let newest = this.#newestPose;
+    for (const { hasResponse, asked } of this.#emitters.values()) if (hasResponse < asked) newest = Math.min(newest, Math.max(0, hasResponse));
     return newest;
   }
 }
