@@ -21,8 +21,8 @@ _YAW_HARMONICS = 3
 _PATH_DIRECTIONS = 2 + 2
 """Number of features that follow the sight feature: the path's directions at both ends."""
 _POSITION_OCTAVES = 3
-_AJAR = 0.03
-"""From this openness on, a network is told its logarithm, as levels go; below, a door is nearly shut."""
+_SHUT = 0.01
+"""The share of power that passes a shut door, as a network is told: what passes a leaf that is ajar adds to it."""
 _BLOCK = 4
 """Points along each side of a block of the grid of rooms."""
 _EARS_M = 1.5
@@ -125,6 +125,28 @@ class _DoorwaysBetween(nn.Module):
         return self._on_the_way[rooms[:, 0] * self._room_count + rooms[:, 1]]
 
 
+class _Apertures(nn.Module):
+    """Looks up how much of the sound passes doors, as a share of what passes when they are open."""
+
+    _passed: Tensor
+    _first: Tensor
+
+    def __init__(self, doorways: Doorways) -> None:
+        super().__init__()
+        doors, self._points = doorways.apertures.shape
+        _keep(self, "passed", doorways.apertures.ravel())
+        _keep(self, "first", np.arange(doors) * self._points, np.int64)
+
+    def forward(self, openness: Tensor) -> Tensor:
+        """(B, door) shares of power for openness (B, door)."""
+        steps = torch.clamp(openness, 0, 1) * (self._points - 1)
+        below = torch.clamp(torch.floor(steps), max=self._points - 2)
+        at = below.long() + self._first
+        before, after = self._passed[at], self._passed[at + 1]
+        passed: Tensor = before + (steps - below) * (after - before)
+        return passed
+
+
 class _Encoder(nn.Module):
     """Features of the path from emitter to listener, and of both ends.
 
@@ -161,6 +183,7 @@ class _Encoder(nn.Module):
         _keep(self, "turns", np.array([[1, 0, 0, 1], [0, 1, -1, 0]]))
         if extent.doorways is not None:
             self._doorways = _DoorwaysBetween(extent.doorways)
+            self._apertures = _Apertures(extent.doorways)
 
     def sight(self, features: Tensor) -> Tensor:
         """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
@@ -191,10 +214,11 @@ class _Encoder(nn.Module):
 
     def _of_doors(self, ends: Tensor, shares: Tensor) -> tuple[Tensor, ...]:
         """What is told of doors that are open by `shares` (B, door): of all, and of those between the `ends` (B, 2, 3)
-        how far they are from open, of which nothing is left when they are."""
-        levels = torch.log(shares + _AJAR)
+        what they keep back, of which nothing is left when they are open."""
+        passed = self._apertures(shares)
+        levels = torch.log(passed + _SHUT)
         between = self._doorways(ends)
-        shut, losses = between * (1 - shares), between * (levels - float(np.log(1 + _AJAR)))
+        shut, losses = between * (1 - passed), between * (levels - float(np.log(1 + _SHUT)))
         return shares, levels, shut, losses, losses.sum(dim=-1, keepdim=True)
 
     def _waves(self, position: Tensor) -> Tensor:

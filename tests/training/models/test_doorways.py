@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from server.acoustics.doors import DoorLeaf, LeafMotion
 from server.acoustics.mesh import TriangleMesh
+from server.acoustics.mesh_tree import MeshTree
 from server.acoustics.sound_path import DESCRIPTION
 from tests.training.learning.test_moving_doors import level
-from tests.two_rooms import EAST, SLIDE, WEST, box, door, leaf
+from tests.two_rooms import EAST, SLIDE, SWING, WEST, box, door, leaf, moving, rooms
 from training.data.levels.level_scene import LevelScene, SceneDoor
-from training.models.doorways import Doorways, _ways
+from training.models.doorways import Doorways, _ways, aperture
 from training.models.encoders import FieldShape, PathEncoder
 from training.models.site import Extent, Reach
 
@@ -58,13 +60,16 @@ def test_a_leaf_that_parts_no_rooms_is_between_none():
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_the_network_is_told_of_doors_on_the_way_until_they_are_open(share):
-    encode = encoder(level())
+    scene = level()
+    encode = encoder(scene)
+    curve = Doorways.of_level(scene).apertures[0]
+    passed = np.interp(share, np.linspace(0, 1, len(curve)), curve)
     path, openness = torch.zeros(2, DESCRIPTION), torch.full((2, 1), share)
     ends = [torch.tensor([WEST, WEST]), torch.tensor([EAST, (1.5, 3.0, 1.5)])]
     all_doors, levels, shut, losses, loss = encode._of_doors(torch.stack(ends, dim=1), openness)
     assert (all_doors == share).all()
     assert levels[0] == levels[1]
-    assert shut.flatten().tolist() == pytest.approx([1 - share, 0.0])
+    assert shut.flatten().tolist() == pytest.approx([1 - passed, 0.0], abs=1e-6)
     torch.testing.assert_close(losses, loss)
     assert (abs(losses[0]) < 1e-6) == (share == 1)
     assert losses[1] == 0
@@ -121,3 +126,53 @@ def test_an_imported_level_without_rooms_has_doors_between_nothing():
     )
     scene = replace(open_air, file=open_air.file.model_copy(update={"geometry": geometry}), mesh=sheet)
     assert not Doorways.of_level(scene).on_the_way.any()
+
+
+def curve(motion: LeafMotion, still: TriangleMesh | None = None):
+    """What passes the door between the two rooms, and how far it is open."""
+    passed = aperture(DoorLeaf(leaf(), motion), rooms().mesh if still is None else still)
+    return passed, np.linspace(0, 1, len(passed))
+
+
+def test_a_sliding_door_lets_by_nearly_as_much_as_it_is_open():
+    passed, share = curve(SLIDE)
+    assert abs(passed - share).max() < 0.08
+
+
+def test_a_swinging_door_lets_nothing_by_until_it_leaves_its_frame():
+    passed, _ = curve(SWING)
+    assert (passed[0], passed[-1]) == (0, 1)
+    assert (np.diff(passed) > -0.01).all()
+    assert passed[2] < 0.01
+    without_frame, _ = curve(SWING, box((-9.0,) * 3, (-8.0,) * 3, "wood"))
+    assert without_frame[2] > 0.04
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
+def test_an_aperture_is_the_share_of_a_diffuse_field_that_comes_through(share):
+    """Against the flux between two planes, one on each side of the door."""
+    rng = np.random.default_rng(7)
+    west, east = (rng.uniform((x, 0.05, 0.05), (x, 4.95, 2.75), (200_000, 3)) for x in (3.1, 5.05))
+    flux = (east - west)[:, 0] ** 2 / np.linalg.norm(east - west, axis=1) ** 4
+    passed = {
+        openness: (flux * MeshTree(moving().mesh_at((openness,))).is_visible(west, east)).sum()
+        for openness in (share, 1.0)
+    }
+    told, shares = curve(SWING)
+    assert np.interp(share, shares, told) == pytest.approx(passed[share] / passed[1.0], abs=0.06)
+
+
+def test_a_leaf_in_nobodys_way_lets_by_as_much_as_it_is_open():
+    standing = LeafMotion("slide", (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0))
+    passed, share = curve(standing)
+    np.testing.assert_allclose(passed, share, atol=1e-6)
+
+
+def test_the_network_looks_up_what_passes():
+    scene = level()
+    doorways, encode = Doorways.of_level(scene), encoder(scene)
+    rng = np.random.default_rng(3)
+    shares = np.concatenate([rng.random(500), [0.0, -0.0, 1.0, 1 + 1e-7, 0.5]]).astype(np.float32)
+    found = encode._apertures(torch.tensor(shares[:, None]))[:, 0].numpy()
+    steps = np.linspace(0, 1, doorways.apertures.shape[1])
+    np.testing.assert_allclose(found, np.interp(shares, steps, doorways.apertures[0]), atol=1e-5)
