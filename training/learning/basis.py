@@ -63,7 +63,7 @@ class BasisLearner(ABC):
         targets."""
         field = self.field
         sample = np.sort(np.random.default_rng([seed, 4]).choice(rows, min(_SAMPLE_ROWS, len(rows)), replace=False))
-        flat = self._flat(sample)
+        flat = self._flat(sample) - self._losses_between(sample) @ field.bands
         field.mean.copy_(flat.mean(dim=0))
         for name, part in field.heads.slices.items():
             field.spread[part] = self._spreads[name]
@@ -71,6 +71,10 @@ class BasisLearner(ABC):
         rank = field.basis.shape[0]
         _, singular, basis = torch.svd_lowrank(normalised, q=min(rank, *normalised.shape), niter=2)
         field.basis[: basis.shape[1]] = basis.T * (singular / len(sample) ** 0.5)[:, None]
+
+    def _losses_between(self, rows: Rows) -> Tensor:
+        """(row, band) what levels lose by the doors between both ends, before training."""
+        return torch.zeros(len(rows), len(self.field.bands))
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         return [{"params": list(self.field.parameters()), "weight_decay": _WEIGHT_DECAY}]
@@ -98,7 +102,7 @@ class BasisLearner(ABC):
             for start in range(0, len(sample), 256):
                 poses, (flat, *_) = self.batch(sample[start : start + 256], None)
                 features = field.encoder(*(pose.to(device) for pose in poses))
-                predicted = field.in_physical_units(field.coefficients_of(features) @ field.basis)
+                predicted = field.in_physical_units(field.from_features(features))
                 yield flat[:, levels].to(device).float(), predicted[:, levels], field.encoder.sight(features)
 
         field.level_correction[:, levels] = level_correction(examples, self._decode.to(device), field.heads.areas)

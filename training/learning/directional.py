@@ -1,12 +1,12 @@
 """The directional field and its loss."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from rich.progress import Progress
-from torch import Tensor
+from torch import Tensor, nn
 
 from server.field.directional_graph import DIRECTIONS, LOG_MAGNITUDE
 from training.data.responses import ResponseSet
@@ -27,6 +27,9 @@ from training.simulation.responses import SimulatedResponses
 # In nepers, and in shares of the power: about what no field can predict from the places alone.
 _SPREADS = {LOG_MAGNITUDE: 0.35, DIRECTIONS: 0.5}
 _EXCHANGED_SHARE = 0.5
+_FIT_STEPS, _FIT_RATE = 400, 0.05
+_FIT_OUTLIER = 0.5
+"""Nepers beyond which a level counts in proportion, and not by its square."""
 _HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
 
 
@@ -108,6 +111,19 @@ class DirectionalLearner(BasisLearner):
         error = self._energy_error.to(flat.device)(self._levels_of(prediction), flat[:, self.field.heads.levels])
         return {**losses, "energy": self.recipe.energy_weight * error}
 
+    def _losses_between(self, rows: Rows) -> Tensor:
+        """What these pairs say of it, whichever rooms are louder or quieter with all doors open."""
+        if not len(self.field.bands):
+            return super()._losses_between(rows)
+        encoder = self.field.encoder
+        (listener, emitter, _, openness), (flat, _) = self.batch(rows, None)
+        rooms = encoder.rooms(listener, emitter)
+        power = torch.exp(2 * flat[:, self.field.heads.levels]) * self.field.heads.areas
+        levels = 0.5 * torch.log(power.unflatten(1, (len(self.field.bands), -1)).sum(dim=-1))
+        _, couple = torch.unique(rooms.sort(dim=1).values, dim=0, return_inverse=True)
+        fit_losses(lambda: encoder.losses(rooms, openness), list(encoder.losses_learned), levels, couple)
+        return encoder.losses(rooms, openness)
+
     def _flat(self, rows: Rows) -> Tensor:
         """(row, heads.size) targets of the recipe's order, which are the beginning of those that are stored."""
         pairs, levels, size = self._pair[rows], self.field.heads.levels, self.field.heads.size
@@ -117,6 +133,23 @@ class DirectionalLearner(BasisLearner):
     def _one_of_each_pair(self, rows: Rows) -> Rows:
         _, first = np.unique(self._pair[rows], return_index=True)
         return rows[np.sort(first)]
+
+
+@torch.enable_grad()
+def fit_losses(
+    losses: Callable[[], Tensor], learned: Sequence[nn.Parameter], levels: Tensor, couple: npt.ArrayLike
+) -> None:
+    """Adjust what is `learned`, so that `losses` (pair, band) follow `levels` but for one constant of each `couple`
+    (pair,) and band. Far outliers count little (Huber's loss)."""
+    members = nn.functional.one_hot(torch.as_tensor(couple)).float()
+    shares = members / members.sum(dim=0)
+    optimiser = torch.optim.Adam(learned, _FIT_RATE)
+    for _ in range(_FIT_STEPS):
+        off = losses() - levels
+        off = off - members @ (shares.T @ off)
+        optimiser.zero_grad()
+        nn.functional.huber_loss(off, torch.zeros_like(off), delta=_FIT_OUTLIER).backward()
+        optimiser.step()
 
 
 def _exchanged(

@@ -38,6 +38,9 @@ class BasisField(nn.Module):
 
     While it is trained, a share `dropout` of each hidden layer's features is left out at random.
 
+    Where doors move, levels are relative to what the octave bands lose by the doors between both ends. `bands`
+    (band, heads.size) has a 1 for the levels of each, else 0; it has no rows where no doors move.
+
     `level_correction` (2, heads.size) is what to add to predicted levels, of pairs out of sight and in sight
     (`training.models.level_correction`).
     """
@@ -45,9 +48,16 @@ class BasisField(nn.Module):
     mean: Tensor
     spread: Tensor
     level_correction: Tensor
+    bands: Tensor
 
     def __init__(
-        self, heads: Layout, encoder: PathEncoder | PoseEncoder, shape: FieldShape, *, dropout: float = 0.0
+        self,
+        heads: Layout,
+        encoder: PathEncoder | PoseEncoder,
+        shape: FieldShape,
+        *,
+        dropout: float = 0.0,
+        bands: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.heads = heads
@@ -60,6 +70,7 @@ class BasisField(nn.Module):
         self.register_buffer("mean", torch.zeros(self.heads.size))
         self.register_buffer("spread", torch.ones(self.heads.size))
         self.register_buffer("level_correction", torch.zeros(2, self.heads.size))
+        self.register_buffer("bands", torch.zeros(0, self.heads.size) if bands is None else bands, persistent=False)
 
     @property
     def width(self) -> int:
@@ -67,14 +78,26 @@ class BasisField(nn.Module):
         return self._inputs.out_features
 
     def forward(self, *pose: Tensor) -> Tensor:
-        return self.coefficients(*pose) @ self.basis
+        return self.from_features(self._features(*pose))
 
     def coefficients(self, *pose: Tensor) -> Tensor:
         """(B, rank) coefficients of the basis."""
+        return self.coefficients_of(self._features(*pose))
+
+    def _features(self, *pose: Tensor) -> Tensor:
         # In low precision, places would be rounded to centimetres.
         with torch.autocast(pose[0].device.type, enabled=False):
-            features = self.encoder(*pose)
-        return self.coefficients_of(features)
+            features: Tensor = self.encoder(*pose)
+        return features
+
+    def from_features(self, features: Tensor) -> Tensor:
+        """Flat predictions from the encoder's features."""
+        return self._less_losses(self.coefficients_of(features) @ self.basis, features)
+
+    def _less_losses(self, flat: Tensor, features: Tensor) -> Tensor:
+        if not len(self.bands):
+            return flat
+        return flat + self.encoder.loss_between(features) @ (self.bands / self.spread)
 
     def coefficients_of(self, features: Tensor) -> Tensor:
         """(B, rank) coefficients from the encoder's features."""
@@ -107,11 +130,11 @@ class BasisField(nn.Module):
         field.basis = nn.Parameter(directions * size[:, None])
         balance = PowerBalance(self.heads.areas)
         levels = self.heads.levels
-        balance.add(
-            self.in_physical_units(coefficients @ self.basis)[:, levels],
-            self.in_physical_units(coefficients @ turn @ field.basis)[:, levels],
-            self.encoder.sight(features),
+        ours, theirs = (
+            self.in_physical_units(self._less_losses(flat, features))[:, levels]
+            for flat in (coefficients @ self.basis, coefficients @ turn @ field.basis)
         )
+        balance.add(ours, theirs, self.encoder.sight(features))
         field.level_correction[:, levels] += balance.deficit()
         return field
 
@@ -122,7 +145,8 @@ class BasisField(nn.Module):
 class ExportedBasis(nn.Module):
     """The flat output in physical units, with corrected levels, as the exported graph computes it.
 
-    Units and level correction are part of the basis and of one offset, where they cost nothing; sight adds a row.
+    Units and level correction are part of the basis and of one offset, where they cost nothing. Sight adds a row, and
+    so does each band of which doors take something.
     """
 
     _basis: Tensor
@@ -136,6 +160,8 @@ class ExportedBasis(nn.Module):
         basis, offset = field.basis.detach() * field.spread, field.mean + in_sight
         if not field.encoder.sees_all:
             basis, offset = torch.cat([basis, (in_sight - out_of_sight)[None]]), field.mean + out_of_sight
+        if len(field.bands):
+            basis = torch.cat([basis, field.bands])
         self.register_buffer("_basis", basis[:, order], persistent=False)
         self.register_buffer("_offset", offset[order], persistent=False)
 
@@ -145,4 +171,6 @@ class ExportedBasis(nn.Module):
         coefficients = self._field.coefficients_of(features)
         if not self._field.encoder.sees_all:
             coefficients = torch.cat([coefficients, self._field.encoder.sight(features)], dim=1)
+        if len(self._field.bands):
+            coefficients = torch.cat([coefficients, self._field.encoder.loss_between(features)], dim=1)
         return torch.addmm(self._offset, coefficients, self._basis)

@@ -40,8 +40,15 @@ class DirectionHeads(nn.Module):
         self.sizes, self.slices = tile(self.shapes)
         self.levels = self.slices[LOG_MAGNITUDE]
         self.size = sum(self.sizes)
+        self._columns = columns.cells
         areas = torch.tensor(columns.widths, dtype=torch.float32).repeat(len(OCTAVE_BANDS_HZ))
         self.register_buffer("areas", areas, persistent=False)
+
+    def of_bands(self) -> Tensor:
+        """(band, size) 1 for the levels of each octave band, else 0."""
+        bands = torch.zeros(len(OCTAVE_BANDS_HZ), self.size)
+        bands[:, self.levels] = torch.eye(len(OCTAVE_BANDS_HZ)).repeat_interleave(self._columns, dim=1)
+        return bands
 
 
 class DirectionalField(BasisField):
@@ -59,7 +66,8 @@ class DirectionalField(BasisField):
     ) -> None:
         """Without `reach`, the field is valid throughout the place."""
         encoder = PathEncoder(extent, shape, reach or Reach.throughout(extent))
-        super().__init__(DirectionHeads(cells, order), encoder, shape, dropout=dropout)
+        heads = DirectionHeads(cells, order)
+        super().__init__(heads, encoder, shape, dropout=dropout, bands=heads.of_bands() if extent.doors else None)
 
 
 class ExportedDirections(ExportedBasis):

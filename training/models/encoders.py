@@ -4,7 +4,7 @@ path between them, of which the network is told.
 A path (B, DESCRIPTION) is described as in `server.acoustics.sound_path.DescribedPaths`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from server.acoustics.bands import OCTAVE_BANDS_HZ
 from server.acoustics.sound_path import DESCRIPTION
 from training.models.doorways import Doorways
 from training.models.site import Extent, Reach
@@ -21,6 +22,8 @@ _YAW_HARMONICS = 3
 _PATH_DIRECTIONS = 2 + 2
 """Number of features that follow the sight feature: the path's directions at both ends."""
 _POSITION_OCTAVES = 3
+_WALLS = 1e-3
+"""The share of power that is taken at first to come through walls."""
 _SHUT = 0.01
 """The share of power that passes a shut door, as a network is told: what passes a leaf that is ajar adds to it."""
 _BLOCK = 4
@@ -82,7 +85,7 @@ def _keep(module: nn.Module, name: str, values: npt.ArrayLike, kind: npt.DTypeLi
 
 
 class _DoorwaysBetween(nn.Module):
-    """Looks up which doors are between two places.
+    """Looks up in which rooms two places are, and which doors are between these.
 
     The grid of rooms is kept as blocks of 4 x 4 x 4 points, each kind of block once: most are within one room, and most
     others alike.
@@ -113,15 +116,19 @@ class _DoorwaysBetween(nn.Module):
         _keep(self, "rooms", kinds.ravel(), np.uint8)
         _keep(self, "on_the_way", doorways.on_the_way.reshape(self._room_count**2, -1))
 
-    def forward(self, ends: Tensor) -> Tensor:
-        """(B, door) 1 for doors between `ends` (B, 2, 3), else 0."""
+    def rooms(self, ends: Tensor) -> Tensor:
+        """(B, 2) the numbers of the rooms of `ends` (B, 2, 3)."""
         steps = torch.clamp(torch.round((ends - self._origin) * self._per_m), min=0)
         steps = torch.minimum(steps, self._last)
         block = torch.floor(steps / _BLOCK)
         # Whole numbers up to 2**24 are exact in single precision.
         kind = self._blocks[(block * self._block_strides).sum(dim=-1).long()].long()
         within = ((steps - _BLOCK * block) * self._strides).sum(dim=-1).long()
-        rooms = self._rooms[kind * _BLOCK**3 + within].long()
+        rooms: Tensor = self._rooms[kind * _BLOCK**3 + within].long()
+        return rooms
+
+    def forward(self, rooms: Tensor) -> Tensor:
+        """(B, door) 1 for doors between rooms (B, 2), else 0."""
         return self._on_the_way[rooms[:, 0] * self._room_count + rooms[:, 1]]
 
 
@@ -145,6 +152,38 @@ class _Apertures(nn.Module):
         before, after = self._passed[at], self._passed[at + 1]
         passed: Tensor = before + (steps - below) * (after - before)
         return passed
+
+
+class _LossBetween(nn.Module):
+    """How much less loud sound is from room to room than with all doors open, in each octave band. What comes through
+    the doors on the way and what comes through walls are powers that add. Learned are the shares of power that pass
+    each shut leaf, and the walls between each couple of rooms.
+
+    Nothing is lost within a room, or where all doors on the way are open: so no level jumps in a doorway.
+    """
+
+    _couple: Tensor
+
+    def __init__(self, doorways: Doorways) -> None:
+        super().__init__()
+        self._rooms, _, doors = doorways.on_the_way.shape
+        one, other = np.triu_indices(self._rooms)
+        couple = np.zeros((self._rooms, self._rooms), np.int64)
+        couple[one, other] = couple[other, one] = np.arange(len(one))
+        _keep(self, "couple", couple.ravel(), np.int64)
+        bands = len(OCTAVE_BANDS_HZ)
+        self.log_through_walls = nn.Parameter(torch.full((len(one), bands), float(np.log(_WALLS))))
+        self.log_through_shut = nn.Parameter(torch.full((doors, bands), float(np.log(_SHUT))))
+
+    def forward(self, rooms: Tensor, between: Tensor, passed: Tensor) -> Tensor:
+        """(B, band) nepers of amplitude, at most zero, for the rooms (B, 2) of both ends, 1 for doors between them
+        (B, door), and what passes these as they are open, (B, door)."""
+        walls = torch.exp(self.log_through_walls[self._couple[rooms[:, 0] * self._rooms + rooms[:, 1]]])
+        shut = torch.exp(self.log_through_shut)
+        through_each = torch.log((passed[:, :, None] + shut) / (1 + shut))
+        through_doors = torch.exp((between[:, :, None] * through_each).sum(dim=1))
+        lost: Tensor = 0.5 * torch.log((through_doors + walls) / (1 + walls))
+        return lost
 
 
 class _Encoder(nn.Module):
@@ -184,10 +223,15 @@ class _Encoder(nn.Module):
         if extent.doorways is not None:
             self._doorways = _DoorwaysBetween(extent.doorways)
             self._apertures = _Apertures(extent.doorways)
+            self._loss_between = _LossBetween(extent.doorways)
 
     def sight(self, features: Tensor) -> Tensor:
         """(B, 1) the sight feature: 1 where listener and emitter see each other, falling to 0 behind a corner."""
         return features[:, -self._after_sight - 1 : -self._after_sight]
+
+    def loss_between(self, features: Tensor) -> Tensor:
+        """(B, band) what levels lose by doors between the rooms of both ends; nothing, (B, 0), where no doors move."""
+        return features[:, : len(OCTAVE_BANDS_HZ) if self.doors else 0]
 
     def _features(
         self, listener: Tensor, emitter: Tensor, path: Tensor, azimuth: Tensor, openness: Sequence[Tensor] = ()
@@ -195,7 +239,7 @@ class _Encoder(nn.Module):
         """(B, feature) all features but those of the head, with the `azimuth` of the path at the listener."""
         length, visible, directions = torch.split(path, [1, 1, _PATH_DIRECTIONS], dim=-1)
         distance = torch.clamp(length, min=self._nearest_m)
-        ends = torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
+        ends = self._ends(listener, emitter)
         scalars = torch.cat([torch.log(distance), 1 / (1 + distance), (emitter - listener)[:, 2:] / distance], dim=-1)
         return torch.cat(
             [
@@ -212,14 +256,34 @@ class _Encoder(nn.Module):
             dim=-1,
         )
 
+    def _ends(self, listener: Tensor, emitter: Tensor) -> Tensor:
+        """(B, 2, 3) both places, within reach."""
+        return torch.minimum(torch.maximum(torch.stack([listener, emitter], dim=1), self._low), self._high)
+
+    def rooms(self, listener: Tensor, emitter: Tensor) -> Tensor:
+        """(B, 2) the numbers of the rooms of both ends, where doors move."""
+        return self._doorways.rooms(self._ends(listener, emitter))
+
+    @property
+    def losses_learned(self) -> Iterator[nn.Parameter]:
+        """What `losses` depends on."""
+        return self._loss_between.parameters()
+
+    def losses(self, rooms: Tensor, shares: Tensor) -> Tensor:
+        """(B, band) what levels lose between `rooms` (B, 2) by doors that are open by `shares` (B, door)."""
+        lost: Tensor = self._loss_between(rooms, self._doorways(rooms), self._apertures(shares))
+        return lost
+
     def _of_doors(self, ends: Tensor, shares: Tensor) -> tuple[Tensor, ...]:
-        """What is told of doors that are open by `shares` (B, door): of all, and of those between the `ends` (B, 2, 3)
-        what they keep back, of which nothing is left when they are open."""
+        """What is told of doors that are open by `shares` (B, door): what levels lose between the `ends` (B, 2, 3), all
+        doors, and of those between the ends what they keep back, of which nothing is left when they are open."""
         passed = self._apertures(shares)
         levels = torch.log(passed + _SHUT)
-        between = self._doorways(ends)
+        rooms = self._doorways.rooms(ends)
+        between = self._doorways(rooms)
         shut, losses = between * (1 - passed), between * (levels - float(np.log(1 + _SHUT)))
-        return shares, levels, shut, losses, losses.sum(dim=-1, keepdim=True)
+        lost = self._loss_between(rooms, between, passed)
+        return lost, shares, levels, shut, losses, losses.sum(dim=-1, keepdim=True)
 
     def _waves(self, position: Tensor) -> Tensor:
         scaled = (position - self._centre) / self._half_size

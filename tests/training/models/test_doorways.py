@@ -13,6 +13,7 @@ from server.acoustics.sound_path import DESCRIPTION
 from tests.training.learning.test_moving_doors import level
 from tests.two_rooms import EAST, SLIDE, SWING, WEST, box, door, leaf, moving, rooms
 from training.data.levels.level_scene import LevelScene, SceneDoor
+from training.learning.directional import fit_losses
 from training.models.doorways import Doorways, _ways, aperture
 from training.models.encoders import FieldShape, PathEncoder
 from training.models.site import Extent, Reach
@@ -26,7 +27,8 @@ def encoder(scene: LevelScene) -> PathEncoder:
 
 def between(scene: LevelScene, one, other) -> list[float]:
     ends = torch.tensor([[one, other]], dtype=torch.float32)
-    return encoder(scene)._doorways(ends)[0].tolist()
+    doorways = encoder(scene)._doorways
+    return doorways(doorways.rooms(ends))[0].tolist()
 
 
 def with_wardrobe() -> LevelScene:
@@ -66,13 +68,16 @@ def test_the_network_is_told_of_doors_on_the_way_until_they_are_open(share):
     passed = np.interp(share, np.linspace(0, 1, len(curve)), curve)
     path, openness = torch.zeros(2, DESCRIPTION), torch.full((2, 1), share)
     ends = [torch.tensor([WEST, WEST]), torch.tensor([EAST, (1.5, 3.0, 1.5)])]
-    all_doors, levels, shut, losses, loss = encode._of_doors(torch.stack(ends, dim=1), openness)
+    lost, all_doors, levels, shut, losses, loss = encode._of_doors(torch.stack(ends, dim=1), openness)
     assert (all_doors == share).all()
     assert levels[0] == levels[1]
     assert shut.flatten().tolist() == pytest.approx([1 - passed, 0.0], abs=1e-6)
     torch.testing.assert_close(losses, loss)
     assert (abs(losses[0]) < 1e-6) == (share == 1)
     assert losses[1] == 0
+    assert (lost[0] <= 0).all()
+    assert (lost[0].abs() < 1e-6).all() == (share == 1)
+    assert (lost[1].abs() < 1e-6).all()
     assert encode(*ends, path, openness).shape == (2, encode.size)
 
 
@@ -94,7 +99,8 @@ def test_places_are_in_the_rooms_that_the_grid_says():
     steps = np.clip(steps, 0, np.array(doorways.rooms.shape) - 1)
     rooms = doorways.rooms[tuple(np.moveaxis(steps, -1, 0))]
     expected = doorways.on_the_way[rooms[:, 0], rooms[:, 1]]
-    found = encoder(scene)._doorways(torch.tensor(ends, dtype=torch.float32))
+    looked_up = encoder(scene)._doorways
+    found = looked_up(looked_up.rooms(torch.tensor(ends, dtype=torch.float32)))
     assert 0.3 < expected.mean() < 0.7
     # Single precision may round a place halfway between two points the other way.
     assert (found.numpy() == expected).all(axis=1).mean() > 0.998
@@ -166,6 +172,40 @@ def test_a_leaf_in_nobodys_way_lets_by_as_much_as_it_is_open():
     standing = LeafMotion("slide", (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0))
     passed, share = curve(standing)
     np.testing.assert_allclose(passed, share, atol=1e-6)
+
+
+def test_powers_through_doors_and_walls_add():
+    """A leaf that lets by a hundredth, and two of them, beside walls that let by a thousandth."""
+    encode = encoder(with_wardrobe())
+    lost = encode._loss_between
+    with torch.no_grad():
+        lost.log_through_shut[:] = float(np.log(0.01))
+        lost.log_through_walls[:] = float(np.log(0.001))
+    rooms = torch.tensor([[0, 1]])
+    both = lost(rooms, torch.tensor([[1.0, 1.0]]), torch.zeros(1, 2))
+    one = lost(rooms, torch.tensor([[1.0, 0.0]]), torch.zeros(1, 2))
+    ajar = lost(rooms, torch.tensor([[1.0, 0.0]]), torch.tensor([[0.25, 0.0]]))
+    for found, power in ((one, 0.01 / 1.01), (both, (0.01 / 1.01) ** 2), (ajar, 0.26 / 1.01)):
+        expected = 0.5 * np.log((power + 0.001) / 1.001)
+        np.testing.assert_allclose(found.detach().numpy(), np.full((1, 7), expected), rtol=1e-5)
+
+
+def test_what_doors_and_walls_let_by_is_found_from_levels():
+    """Whichever rooms are louder, and although some levels are far off."""
+    encode, truth = encoder(level()), encoder(level())
+    rng = np.random.default_rng(5)
+    with torch.no_grad():
+        for parameter in truth.losses_learned:
+            parameter += torch.tensor(rng.uniform(-1.0, 1.5, parameter.shape), dtype=torch.float32)
+    rooms = torch.tensor(rng.integers(0, 2, (3_000, 2)))
+    couple = rooms.sum(dim=1)
+    shares = torch.tensor(rng.choice([0.0, 0.05, 0.1, 0.3, 1.0], (3_000, 1)), dtype=torch.float32)
+    with torch.no_grad():
+        wanted = truth.losses(rooms, shares)
+        levels = wanted + torch.tensor([0.3, -1.0, 0.8])[couple][:, None] + 0.1 * torch.randn(3_000, 7)
+        levels[::50] -= 4.0
+    fit_losses(lambda: encode.losses(rooms, shares), list(encode.losses_learned), levels, couple)
+    torch.testing.assert_close(encode.losses(rooms, shares), wanted, rtol=0, atol=0.1)
 
 
 def test_the_network_looks_up_what_passes():
