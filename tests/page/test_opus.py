@@ -24,7 +24,8 @@ READ = """async ({ opus, messages }) => {
   return new Promise((resolve, reject) => {
     const found = [];
     const reader = new OpusReader(opus, ({ sampleClock, channels }) => {
-      found.push([sampleClock, channels.map((samples) => text(new Uint8Array(samples.buffer, samples.byteOffset, samples.byteLength)))]);
+      const bytesOf = ({ buffer, byteOffset, byteLength }) => new Uint8Array(buffer, byteOffset, byteLength);
+      found.push([sampleClock, channels.map((samples) => text(bytesOf(samples)))]);
       if (found.length === messages.length) resolve(found);
     }, reject);
     for (const message of messages) {
