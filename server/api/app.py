@@ -195,6 +195,7 @@ def create_app(
         version=version("nafir"),
         description="Renders how a place sounds, in real time. Live streams are described at /asyncapi.json.",
         lifespan=lifespan,
+        openapi_url=None,  # `install_openapi` answers sooner
         docs_url=None,  # the page has both, without scripts from elsewhere
         redoc_url=None,
     )

@@ -657,8 +657,21 @@ def test_too_many_waiting_requests_are_turned_away_and_health_is_answered_meanwh
 
 
 def test_the_interface_describes_itself(shared_client):
-    paths = shared_client.get("/openapi.json").json()["paths"]
-    assert IR.replace("flat", "{scene}") in paths
+    document = shared_client.get("/openapi.json").json()
+    assert document == json.loads(json.dumps(shared_client.app.openapi()))
+    assert IR.replace("flat", "{scene}") in document["paths"]
+
+
+def test_behind_a_proxy_that_serves_it_below_a_path_the_interface_says_so(shared_client, monkeypatch):
+    at_the_root = shared_client.get("/openapi.json").json()
+    monkeypatch.setattr(shared_client._transport, "root_path", "/sound")
+    assert shared_client.get("/sound/openapi.json").json() == at_the_root | {"servers": [{"url": "/sound"}]}
+
+
+def test_the_interface_is_written_once(shared_client, monkeypatch):
+    first = shared_client.get("/openapi.json").content
+    monkeypatch.setattr("server.api.openapi.json.dumps", lambda *_, **__: pytest.fail("written again"))
+    assert shared_client.get("/openapi.json").content == first
 
 
 @pytest.mark.parametrize("path", ["/livez", "/readyz"])
