@@ -27,7 +27,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
@@ -256,6 +256,8 @@ class _LostStream:
     asked: Resume
     kept: KeptStream
     snapshot: Snapshot
+    outcome: Literal["resumed", "resumed_from_snapshot"]
+    """As what it is counted once it goes on."""
 
 
 @dataclass
@@ -618,6 +620,7 @@ class Connection:
             place.listeners = len(stream.audience.members)
             host.admission.open(place, stream)
             if lost is not None:
+                host.kept.outcomes[lost.outcome] += 1
                 host.settle(lost.kept, is_resumed=True)
             return await self._pump(stream, hello, place)
         finally:
@@ -679,18 +682,17 @@ class Connection:
         require_protocol(asked)
         host = self._host
         kept = None if asked.token is None else await host.take_kept(asked.token, owner=self._owner)
-        if kept is not None:
-            host.kept.outcomes["resumed"] += 1
-        elif asked.snapshot is not None and host.seal is not None:
+        outcome: Literal["resumed", "resumed_from_snapshot"] = "resumed"
+        if kept is None and asked.snapshot is not None and host.seal is not None:
             data, plays_at = host.seal.open(asked.snapshot, now=host.wall_s(), owner=self._owner or "")
             kept = KeptStream(data, self._time_s() + plays_at - host.wall_s())
-            host.kept.outcomes["resumed_from_snapshot"] += 1
-        else:
+            outcome = "resumed_from_snapshot"
+        if kept is None:
             host.kept.outcomes["unknown"] += 1
             problem = f"no stream is kept for this token, or its {host.kept.keep_s:g} s are over: send a hello"
             raise RequestError("unknown_resume_token", problem, field="token", status=404)
         try:
-            return _LostStream(asked, kept, Snapshot.parse(kept.data))
+            return _LostStream(asked, kept, Snapshot.parse(kept.data), outcome)
         except RequestError:
             if kept.place is not None:
                 self._host.admission.leave(kept.place)

@@ -544,6 +544,31 @@ def test_without_a_secret_there_are_no_snapshots(served):
         assert again.first.code == "unknown_resume_token"
 
 
+def resumptions_of(address, outcome):
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=5) as answer:
+        lines = answer.read().decode().splitlines()
+    start = f'nafir_stream_resumptions_total{{outcome="{outcome}"}} '
+    return next(float(line.removeprefix(start)) for line in lines if line.startswith(start))
+
+
+@pytest.mark.untimed
+def test_a_stream_that_was_found_but_cannot_go_on_is_not_counted_as_resumed(serving, bundle, hrtfs):
+    """A client that is refused, or tires of waiting, asks again: its stream goes on once."""
+    levels, secret, outcome = FieldsByLevel.load(bundle), "a secret of both servers", "resumed_from_snapshot"
+    two = serving(levels, hrtfs, resume_secret=secret)
+    one = serving(levels, hrtfs, resume_secret=secret, max_listeners=1)
+    with two as roomy, one as narrow:
+        with listening(roomy, HELLO.model_copy(update={"snapshots": True, "listeners": 2})) as before:
+            snapshot = before.until(SnapshotTaken, patience_s=10.0).snapshot
+        asked = before.resumption(token=None, snapshot=snapshot)
+        with listening(narrow, asked) as refused:
+            assert refused.first.code == "too_many_listeners"
+            assert resumptions_of(narrow, outcome) == 0
+        with listening(roomy, asked) as again:
+            assert again.first.resumed is not None
+            assert resumptions_of(roomy, outcome) == 1
+
+
 @pytest.mark.long
 def test_a_server_that_is_killed_costs_a_fade(bundle, expected):
     """Its client has kept the newest snapshot, goes on with it at another server, and learns what is not in it."""
