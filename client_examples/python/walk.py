@@ -6,7 +6,8 @@
 Plays a clip where the scene suggests, and walks from the scene's starting place through its openings towards the clip
 while looking around. It writes two files: the sound as it arrived, and the path as it was heard. For each pose, the
 path has the sample from which on the direct sound was heard from it, the sample for the reverberation, which follows
-later and skips poses, and the quality level. `nafir render` makes the same sound from that path, to the sample.
+later and skips poses, and the quality level. `nafir render` makes the same sound from that path, to the sample, unless
+the server was under load. The walk says so then.
 """
 
 import asyncio
@@ -44,6 +45,8 @@ async def listen(wish: Namespace) -> None:
     write_wav(wish.output, recording.samples(), stream.sample_rate)
     print(f"{wish.output}: {duration_s:.2f} s; {csv}: {rows} poses", *stream.statistics.sentences(), sep="\n")
     print(f"Render it again:\n  {render_command(stream.scene, wish.clip, csv, duration_s)}")
+    if path.was_under_load:
+        print("The server was under load and used parts of responses again: the samples will differ.")
 
 
 parser = program("Walk through a scene and store the sound.", output="heard.wav")

@@ -228,9 +228,10 @@ def test_a_path_as_heard_has_the_levels_of_its_own_listener():
     for path in (first, second):
         path.note_pose(1, pose())
         path.note_block(wire.parse_block(block_of(0, 0, 0, pose_id=1), "f32", 0.0))
-        for change in ({"level": "a"}, {"level": "b", "listener": "p2"}):
+        for change in ({"level": "a", "reason": "chosen"}, {"level": "b", "reason": "load", "listener": "p2"}):
             path.note_message({"type": "level_changed", "sample_clock": 0, **change})
     assert [row[3] for row in first.rows(0, "") + second.rows(0, "")] == ["a", "b"]
+    assert (first.was_under_load, second.was_under_load) == (False, True)
 
 
 def test_listeners_hear_the_same_clip_each_from_its_own_place(served):

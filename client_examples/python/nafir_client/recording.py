@@ -82,10 +82,14 @@ class PathAsHeard:
     """From which sample on each pose and each quality level was heard by the first listener of a stream, or by the one
     with the id `listener`.
 
-    `nafir render --path` makes the same sound from the file that `write` makes.
+    `nafir render --path` makes the same sound from the file that `write` makes, to the sample unless
+    `was_under_load`.
     """
 
     def __init__(self, listener: str | None = None) -> None:
+        self.was_under_load = False
+        """Whether the server has lowered the quality for load. It then uses the later parts of responses again at other
+        poses, which the path does not tell."""
         self._listener = listener
         self._poses: dict[int, Pose] = {}
         self._levels: dict[int, str] = {}
@@ -99,6 +103,7 @@ class PathAsHeard:
     def note_message(self, message: Message) -> None:
         if message["type"] == "level_changed" and message.get("listener") == self._listener:
             self._levels[message["sample_clock"]] = message["level"]
+            self.was_under_load |= message["reason"] == "load"
 
     def note_block(self, block: Block) -> None:
         self._heard.append((block.sample_clock, block.pose_id, block.reverberation_pose_id))
