@@ -14,7 +14,7 @@ from training.learning.learner import Losses, Rows
 from training.learning.schedule import one_cycle
 from training.models.basis_field import BasisField
 from training.models.cells import Cells
-from training.models.level_correction import level_correction
+from training.models.level_correction import band_correction, band_levels, level_correction
 from training.models.stored_targets import Targets
 
 TARGETS = "targets"
@@ -91,21 +91,39 @@ class BasisLearner(ABC):
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> None:
-        """Correct predicted levels by their mean deficit over the training set."""
+        """Correct predicted levels by their mean deficit over the training set, and those of bands by what is lacking
+        then."""
         if self._decode is None:
             return
-        field, levels = self.field, self.field.heads.levels
-        device = field.mean.device
+        field, areas = self.field, self.field.heads.areas
+        decode, levels = self._decode.to(field.mean.device), field.heads.levels
         sample = rows[:: max(1, len(rows) // _SAMPLE_ROWS)]
 
         def examples() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-            for start in range(0, len(sample), 256):
-                poses, (flat, *_) = self.batch(sample[start : start + 256], None)
-                features = field.encoder(*(pose.to(device) for pose in poses))
-                predicted = field.in_physical_units(field.from_features(features))
-                yield flat[:, levels].to(device).float(), predicted[:, levels], field.encoder.sight(features)
+            for true, predicted, features in self._predicted(sample):
+                yield true, predicted, field.encoder.sight(features)
 
-        field.level_correction[:, levels] = level_correction(examples, self._decode.to(device), field.heads.areas)
+        correction = level_correction(examples, decode, areas)
+        field.level_correction[:, levels] = correction
+        if not len(field.bands):
+            return
+        hidden, lacking = [], []
+        bands = field.bands[:, levels]
+        for true, predicted, features in self._predicted(self.validation(rows)):
+            corrected = predicted + torch.lerp(correction[0], correction[1], field.encoder.sight(features))
+            hidden.append(field.hidden(features))
+            lacking.append(band_levels(true, areas, bands) - band_levels(decode(corrected), areas, bands))
+        field.band_correction.copy_(band_correction(torch.cat(hidden), torch.cat(lacking)))
+
+    def _predicted(self, rows: Rows) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Batches of true levels, predicted levels without corrections, and the encoder's features."""
+        field, levels = self.field, self.field.heads.levels
+        device = field.mean.device
+        for start in range(0, len(rows), 256):
+            poses, (flat, *_) = self.batch(rows[start : start + 256], None)
+            features = field.encoder(*(pose.to(device) for pose in poses))
+            predicted = field.in_physical_units(field.from_features(features))
+            yield flat[:, levels].to(device).float(), predicted[:, levels], features
 
     def _flat(self, rows: Rows) -> Tensor:
         """(row, heads.size) flat targets."""

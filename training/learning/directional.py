@@ -113,7 +113,7 @@ class DirectionalLearner(BasisLearner):
 
     def _losses_between(self, rows: Rows) -> Tensor:
         """What these pairs say of it, whichever rooms are louder or quieter with all doors open."""
-        if not len(self.field.bands):
+        if not self.field.encoder.doors:
             return super()._losses_between(rows)
         encoder = self.field.encoder
         (listener, emitter, _, openness), (flat, _) = self.batch(rows, None)

@@ -38,17 +38,19 @@ class BasisField(nn.Module):
 
     While it is trained, a share `dropout` of each hidden layer's features is left out at random.
 
-    Where doors move, levels are relative to what the octave bands lose by the doors between both ends. `bands`
-    (band, heads.size) has a 1 for the levels of each, else 0; it has no rows where no doors move.
+    `bands` (band, heads.size) has a 1 for the levels of each octave band, else 0; it has no rows where levels are not
+    those of bands. Where doors move, levels are relative to what the bands lose by the doors between both ends.
 
-    `level_correction` (2, heads.size) is what to add to predicted levels, of pairs out of sight and in sight
-    (`training.models.level_correction`).
+    Two corrections are added after training (`training.models.level_correction`). `level_correction` (2, heads.size)
+    is that of each level, of pairs out of sight and in sight. `band_correction` (band, 1 + width) is that of whole
+    bands: an offset, and the weights of the features of the last hidden layer.
     """
 
     mean: Tensor
     spread: Tensor
     level_correction: Tensor
     bands: Tensor
+    band_correction: Tensor
 
     def __init__(
         self,
@@ -70,7 +72,9 @@ class BasisField(nn.Module):
         self.register_buffer("mean", torch.zeros(self.heads.size))
         self.register_buffer("spread", torch.ones(self.heads.size))
         self.register_buffer("level_correction", torch.zeros(2, self.heads.size))
-        self.register_buffer("bands", torch.zeros(0, self.heads.size) if bands is None else bands, persistent=False)
+        bands = torch.zeros(0, self.heads.size) if bands is None else bands
+        self.register_buffer("bands", bands, persistent=False)
+        self.register_buffer("band_correction", torch.zeros(len(bands), 1 + shape.width))
 
     @property
     def width(self) -> int:
@@ -91,21 +95,31 @@ class BasisField(nn.Module):
         return features
 
     def from_features(self, features: Tensor) -> Tensor:
-        """Flat predictions from the encoder's features."""
+        """Flat predictions, without corrections, from the encoder's features."""
         return self._less_losses(self.coefficients_of(features) @ self.basis, features)
 
     def _less_losses(self, flat: Tensor, features: Tensor) -> Tensor:
-        if not len(self.bands):
+        if not self.encoder.doors:
             return flat
         return flat + self.encoder.loss_between(features) @ (self.bands / self.spread)
 
     def coefficients_of(self, features: Tensor) -> Tensor:
         """(B, rank) coefficients from the encoder's features."""
+        coefficients: Tensor = self._coefficients(self.hidden(features))
+        return coefficients
+
+    def hidden(self, features: Tensor) -> Tensor:
+        """(B, width) features of the last hidden layer from the encoder's."""
         hidden = nn.functional.gelu(self._inputs(features))
         for layer in self._hidden:
             hidden = hidden + self._dropout(nn.functional.gelu(layer(hidden)))
-        coefficients: Tensor = self._coefficients(hidden)
-        return coefficients
+        return hidden
+
+    def readout(self) -> tuple[Tensor, Tensor]:
+        """Weights (rank + band, width) and offsets (rank + band,) of what follows the last hidden layer: the
+        coefficients, and the corrections of bands in nepers."""
+        layer, corrections = self._coefficients, self.band_correction
+        return torch.cat([layer.weight, corrections[:, 1:]]), torch.cat([layer.bias, corrections[:, 0]])
 
     @torch.no_grad()
     def truncated(self, rank: int, *poses: Tensor) -> Self:
@@ -146,31 +160,36 @@ class ExportedBasis(nn.Module):
     """The flat output in physical units, with corrected levels, as the exported graph computes it.
 
     Units and level correction are part of the basis and of one offset, where they cost nothing. Sight adds a row, and
-    so does each band of which doors take something.
+    so does each band: one for its correction, and one for what doors take.
     """
 
     _basis: Tensor
     _offset: Tensor
+    _readout: Tensor
+    _readout_offset: Tensor
 
     def __init__(self, field: BasisField, order: Tensor) -> None:
         """`order` (heads.size,) numbers the flat output's elements in the order in which the graph wants them."""
         super().__init__()
         self._field = field
         out_of_sight, in_sight = field.level_correction
-        basis, offset = field.basis.detach() * field.spread, field.mean + in_sight
+        basis, offset = torch.cat([field.basis.detach() * field.spread, field.bands]), field.mean + in_sight
         if not field.encoder.sees_all:
             basis, offset = torch.cat([basis, (in_sight - out_of_sight)[None]]), field.mean + out_of_sight
-        if len(field.bands):
+        if field.encoder.doors:
             basis = torch.cat([basis, field.bands])
+        readout, readout_offset = field.readout()
+        self.register_buffer("_readout", readout.detach(), persistent=False)
+        self.register_buffer("_readout_offset", readout_offset.detach(), persistent=False)
         self.register_buffer("_basis", basis[:, order], persistent=False)
         self.register_buffer("_offset", offset[order], persistent=False)
 
     def _flat(self, *pose: Tensor) -> Tensor:
         """(B, heads.size) in the graph's order."""
         features = self._field.encoder(*pose)
-        coefficients = self._field.coefficients_of(features)
+        coefficients = nn.functional.linear(self._field.hidden(features), self._readout, self._readout_offset)
         if not self._field.encoder.sees_all:
             coefficients = torch.cat([coefficients, self._field.encoder.sight(features)], dim=1)
-        if len(self._field.bands):
+        if self._field.encoder.doors:
             coefficients = torch.cat([coefficients, self._field.encoder.loss_between(features)], dim=1)
         return torch.addmm(self._offset, coefficients, self._basis)

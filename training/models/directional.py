@@ -67,7 +67,7 @@ class DirectionalField(BasisField):
         """Without `reach`, the field is valid throughout the place."""
         encoder = PathEncoder(extent, shape, reach or Reach.throughout(extent))
         heads = DirectionHeads(cells, order)
-        super().__init__(heads, encoder, shape, dropout=dropout, bands=heads.of_bands() if extent.doors else None)
+        super().__init__(heads, encoder, shape, dropout=dropout, bands=heads.of_bands())
 
 
 class ExportedDirections(ExportedBasis):

@@ -1,13 +1,20 @@
 """By how much predicted levels are too low on average. A regression on log-magnitude predicts the mean of logarithms.
 For noise, this is 2.5 dB below the logarithm of the mean power, and the gap also depends on how uncertain the field is.
 
+Levels of cells are corrected for all pairs in sight alike, and for all others. But the farther apart two rooms are, the
+more do cells differ by chance, and so the more does a sum over them lack. Levels of whole bands are therefore corrected
+once more, pair by pair.
+
 Axes: B pairs, n levels (natural logarithms of magnitude).
 """
 
 import math
 from collections.abc import Callable, Iterable
 
+import numpy as np
 import torch
+from sklearn.linear_model import RidgeCV
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor, nn
 
 from training.models.cells import Cells
@@ -15,6 +22,8 @@ from training.models.cells import Cells
 # Raising the level of one cell also raises its neighbours, by interpolation. One step leaves a twentieth of the error
 # of a reverberation time, three steps less than a hundredth.
 _STEPS = 3
+_PENALTIES = np.logspace(0, 5, 6)
+"""Penalties of the ridge regression to choose from, for features of unit variance."""
 
 
 class InterpolatedLevels(nn.Module):
@@ -115,3 +124,20 @@ def level_correction(
             balance.add(true, decode(corrected), sight)
         correction += balance.deficit()
     return correction
+
+
+def band_levels(levels: Tensor, areas: Tensor, bands: Tensor) -> Tensor:
+    """(B, band) half the logarithms of the energies of bands, whose levels are those with a 1 in `bands` (band, n)."""
+    return 0.5 * torch.log((areas * torch.exp(2 * levels)) @ bands.T)
+
+
+def band_correction(hidden: Tensor, lacking: Tensor) -> Tensor:
+    """(band, 1 + feature) offsets and weights by which features `hidden` (B, feature) say what the levels of bands are
+    `lacking` (B, band): a ridge regression, whose penalty of each band leaves the least error to pairs that are left
+    out (`sklearn.linear_model.RidgeCV`)."""
+    scaler = StandardScaler()
+    features = scaler.fit_transform(hidden.double().cpu().numpy())
+    fitted = RidgeCV(_PENALTIES, alpha_per_target=True).fit(features, lacking.double().cpu().numpy())
+    weights = fitted.coef_ / scaler.scale_
+    offsets = fitted.intercept_ - weights @ scaler.mean_
+    return torch.from_numpy(np.column_stack([offsets, weights])).to(hidden)

@@ -131,6 +131,23 @@ def test_power_is_that_of_the_training_pairs_on_average(dataset, learned):
     assert error.abs().max() < 0.5
 
 
+def test_bands_have_the_levels_of_the_training_pairs_on_average(dataset, learned):
+    """In decibels, and not in power: it is what one hears."""
+    responses = SimulatedResponses(dataset)
+    learner = load_learner(responses, learned)
+    learner.prepare(SILENT)
+    rows, _ = split(responses, share=1.0, seed=0)
+    poses, (flat, _) = learner.batch(learner.validation(rows), None)
+    levels = learner.field.heads.shapes["log_magnitude"]
+    frames = learner.cells.all_frames
+    widths = torch.tensor(frames.widths).float()
+    with torch.no_grad():
+        log_magnitude, _ = ExportedDirections(learner.field, learner.cells)(*poses)
+    found = torch.exp(2 * log_magnitude @ torch.tensor(frames.spread())) @ torch.tensor(frames.pool()) @ widths
+    true = torch.exp(2 * flat[:, learner.field.heads.levels].reshape(-1, *levels)) @ widths
+    assert (10 * torch.log10(found / true)).mean(dim=0).abs().max() < 0.01
+
+
 def test_an_interrupted_run_goes_on_to_the_same_field(dataset, directional, tmp_path, monkeypatch):
     responses = SimulatedResponses(dataset)
     short = dataclasses.replace(directional, epochs=3, recipe=DirectionalRecipe(order=1, noise_m=0.1))

@@ -85,6 +85,21 @@ def test_sight_is_found_among_the_features():
     torch.testing.assert_close((corrected - plain)[:, 0, 0], torch.tensor([0.5, 0.0]), rtol=0, atol=1e-4)
 
 
+def test_a_correction_of_bands_raises_all_levels_of_a_band_and_no_share():
+    field, at = made(), places(5)
+    plain = ExportedDirections(field, CELLS)(*at)
+    with torch.no_grad():
+        hidden = field.hidden(field.encoder(*at))
+        field.band_correction[2, 0] = 0.5
+        field.band_correction[4, 1:] = 0.1
+        corrected = ExportedDirections(field, CELLS)(*at)
+    expected = torch.zeros(5, 7, 1)
+    expected[:, 2], expected[:, 4] = 0.5, 0.1 * hidden.sum(dim=1, keepdim=True)
+    raised = expected.expand_as(plain[0])
+    torch.testing.assert_close(corrected[0] - plain[0], raised, rtol=0, atol=1e-4)
+    torch.testing.assert_close(corrected[1], plain[1], rtol=0, atol=1e-5)
+
+
 def test_a_truncated_field_loses_what_no_field_of_its_rank_could_keep():
     field, at = made(), places(200)
     with torch.no_grad():

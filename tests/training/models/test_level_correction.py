@@ -6,7 +6,13 @@ import torch
 
 from server.acoustics.codec import Codec
 from training.models.cells import Cells
-from training.models.level_correction import InterpolatedLevels, PowerBalance, level_correction
+from training.models.level_correction import (
+    InterpolatedLevels,
+    PowerBalance,
+    band_correction,
+    band_levels,
+    level_correction,
+)
 
 IN_SIGHT, OUT_OF_SIGHT = torch.ones(4, 1), torch.zeros(4, 1)
 LOUD = torch.tensor([[0.0, -1.0], [0.5, -0.5], [-0.3, -0.7], [0.1, -1.2]])
@@ -122,3 +128,30 @@ def test_what_is_heard_of_a_correction_is_corrected_too():
         lambda: [(LOUD, LOUD - 0.4, IN_SIGHT)], lambda heard: LOUD + (heard - LOUD) / 2, torch.ones(2)
     )
     torch.testing.assert_close(correction[1], torch.full((2,), 0.2 + 0.1 + 0.05))
+
+
+def test_the_level_of_a_band_is_that_of_its_energy():
+    levels = torch.log(torch.tensor([[1.0, 2.0, 3.0]]))
+    bands = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    areas = torch.tensor([4.0, 5.0, 1.0])
+    torch.testing.assert_close(band_levels(levels, areas, bands), 0.5 * torch.log(torch.tensor([[13.0, 20.0]])))
+
+
+def test_what_bands_lack_is_told_by_the_features_that_say_it():
+    generator = torch.Generator().manual_seed(0)
+    hidden = 3.0 + 0.5 * torch.randn(2_000, 4, generator=generator)
+    weights, offsets = torch.tensor([[0.2, -0.1, 0.0, 0.0], [0.0, 0.0, 0.3, 0.0]]), torch.tensor([-0.4, 0.1])
+    lacking = hidden @ weights.T + offsets + 0.1 * torch.randn(2_000, 2, generator=generator)
+    found = band_correction(hidden, lacking)
+    torch.testing.assert_close(found[:, 1:], weights, rtol=0, atol=0.02)
+    torch.testing.assert_close(found[:, 0], offsets, rtol=0, atol=0.06)
+
+
+def test_chance_tells_nothing_of_what_bands_lack():
+    """Of fewer pairs than features, which could explain everything."""
+    generator = torch.Generator().manual_seed(0)
+    hidden, lacking = torch.randn(60, 200, generator=generator), torch.randn(60, 2, generator=generator)
+    found = band_correction(hidden, lacking)
+    others = torch.randn(500, 200, generator=generator)
+    assert (others @ found[:, 1:].T).std() < 0.1
+    torch.testing.assert_close(found[:, 0], lacking.mean(dim=0), rtol=0, atol=0.05)
