@@ -44,6 +44,9 @@ _SHORTEST_S, _LONGEST_S = 0.3, 8.0
 _EYRING = 0.161
 _MOST_POINTS = 500_000
 """Points of space among which the start is looked for."""
+_ARRIVAL_DIRECTIONS = 48
+"""With few directions, the waves that arrive from them interfere at the ears, and IACC comes out too large: that of
+diffuse sound (T60 0.5 s, 48 kHz) is 0.128 with 24 directions, 0.104 with 48 and 0.099 with 240."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +284,7 @@ def _file(
             yaws=12,
             rays=choices.rays,
             image_order=3,
-            arrival_directions=24,
+            arrival_directions=_ARRIVAL_DIRECTIONS,
             held_out_share=0.1,
         ),
     )
