@@ -1,9 +1,9 @@
 """By how much predicted levels are too low on average. A regression on log-magnitude predicts the mean of logarithms.
 For noise, this is 2.5 dB below the logarithm of the mean power, and the gap also depends on how uncertain the field is.
 
-Levels of cells are corrected for all pairs in sight alike, and for all others. But the farther apart two rooms are, the
-more do cells differ by chance, and so the more does a sum over them lack. Levels of whole bands are therefore corrected
-once more, pair by pair.
+Levels of cells are corrected for all pairs in sight alike, and for all others alike. But chance decides more about
+single cells where two rooms are far apart, so sums over cells are still too low there. Levels of whole bands are
+therefore corrected once more, pair by pair.
 
 Axes: B pairs, n levels (natural logarithms of magnitude).
 """
