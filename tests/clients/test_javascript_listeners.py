@@ -14,6 +14,7 @@ from server.protocol.client_messages import (
     AddListener,
     Hello,
     ListenerPose,
+    MoveEmitter,
     RemoveEmitter,
     RemoveListener,
     Resume,
@@ -203,6 +204,69 @@ LOST = [["lose", 1006], ["reconnect", None], ["open", None]]
 
 def emitter(identifier, gain_db=0):
     return ["emitter", {"id": identifier, "live": True, "gainDb": gain_db, **at(2)}]
+
+
+def radio(x, *, name="radio", clip="a", gain_db=0.0):
+    return {"id": name, "clip": clip, "position": [x, 1.0, 1.5], "gainDb": gain_db, "at": 0}
+
+
+def refused_emitter(name="radio", code="server_busy", **more):
+    return {"type": "error", "code": code, "message": "no", "field": None, "emitter": name, **more}
+
+
+def added(name="radio"):
+    return {"type": "emitter_added", "id": name, "sample_clock": 0}
+
+
+def test_an_emitter_that_a_full_server_refuses_is_asked_for_as_it_is_when_it_says(tmp_path):
+    _, asked, moved, again, gone_on = run(
+        tmp_path,
+        OPENED,
+        [
+            ["emitter", radio(1)],
+            ["emitter", radio(9, name="lamp", clip="unheard-of")],
+            ["receive", refused_emitter(retry_after_s=0.5)],
+            ["receive", refused_emitter("lamp", "unknown_clip")],
+        ],
+        [["emitter", radio(2)], ["emitter", radio(3, gain_db=-6.0)], ["pause", SETTLED_MS]],
+        [["pause", 600]],
+        [["receive", added()], ["emitter", radio(4, gain_db=-6.0)], ["pause", SETTLED_MS]],
+    )
+    assert [each.id for each in of(AddEmitter, asked)] == ["radio", "lamp"]
+    assert moved[0] == []  # it would be said of one that is not there
+    [once_more] = of(AddEmitter, again)
+    assert (once_more.id, once_more.position[0], once_more.gain_db) == ("radio", 3.0, -6.0)
+    [move] = of(MoveEmitter, gone_on)
+    assert (move.id, move.position[0]) == ("radio", 4.0)
+
+
+def test_a_refused_emitter_is_asked_for_again_by_a_stream_that_goes_on(tmp_path):
+    refused = [["emitter", radio(1)], ["receive", refused_emitter(retry_after_s=20)]]
+    lost = [["lose", 1006], ["emitter", radio(2)], ["reconnect", None], ["open", None]]
+    _, _, _, gone_on = run(tmp_path, OPENED, refused, lost, [["receive", resumed(handled=1)], ["pause", SETTLED_MS]])
+    [asked] = of(AddEmitter, gone_on)
+    assert (asked.id, asked.position[0]) == ("radio", 2.0)
+
+
+def test_a_refused_emitter_is_gone_without_a_word_once_it_is_removed_or_stopped(tmp_path):
+    both = [[["emitter", radio(1, name=name)], ["receive", refused_emitter(name, retry_after_s=0.2)]] for name in "ab"]
+    _, _, ended, later = run(
+        tmp_path,
+        OPENED,
+        both[0] + both[1],
+        [["removeEmitter", "a"], ["stop", {"id": "b", "fadeS": 0.01}], ["pause", SETTLED_MS]],
+        [["pause", 300]],
+    )
+    assert ended == ([], [{"ended": {"id": "b", "removed": True}}])
+    assert of(AddEmitter, later) == []
+
+
+def test_listeners_at_rest_say_where_they_are_while_an_emitter_moves(tmp_path):
+    steps = [step for x in range(26) for step in (["emitter", radio(1 + x / 8)], ["pause", 100])]
+    heard = [["emitter", radio(1)], ["receive", added()], ["pause", SETTLED_MS]]
+    *_, moving = run(tmp_path, OPENED, JOINED, heard, steps)
+    indices = [each.index for each in of(ListenerPose, moving)]
+    assert min(indices.count(None), indices.count(1)) >= 2
 
 
 def test_of_gains_in_an_outage_the_newest_is_said_and_counted(tmp_path):

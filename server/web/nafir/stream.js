@@ -18,6 +18,7 @@ const ACCESS_ENDED = 4401; // the key or token has expired or was revoked
 const TAKEN_OVER = 4409; // another connection has resumed the stream
 const ENDED = 1000; // for good
 const LOST = 4000; // a connection that is given up, whose stream is to be kept
+const NO_EMITTER = "unknown_emitter";
 const FORGOTTEN = "unknown_resume_token";
 const DRAINING = "server_draining";
 const NOT_KNOWN = "unknown_message"; // said by a server that is too old to have several listeners in a stream
@@ -59,6 +60,7 @@ export class Stream {
   #comeBackMs = null; // after which a server without room said to come back
   #goOnMs = null; // after which one that shuts down said to go on
   #missing = new Set(); // ids of emitters that were asked for and are not heard yet
+  #refused = new Map(); // id of each of them that the server did not take when it was last asked -> whether it may be asked again
   #asking = 0; // timer that asks for them again
   #encoding = "f32";
   #opus = null; // the reader of the first listener's blocks in Opus
@@ -86,6 +88,7 @@ export class Stream {
   #others = new Map(); // id -> listener beside the first: {position, orientation, head, at} and what `#entered` adds
   #dirty = new Set(); // "listener" and ids of emitters and other listeners that moved since they were last sent
   #sentAt = 0;
+  #posedAt = new Map(); // id of a listener, null for the first -> when its pose was last sent
   #sending = 0;
   #heartbeat = 0;
 
@@ -119,11 +122,13 @@ export class Stream {
     this.#emitters.set(id, emitter);
     if (!this.#isOpen) return;
     if (!known || known.clip !== clip) {
-      if (known) this.#order(message.removeEmitter(id), { emitter: id });
+      if (known && !this.#refused.has(id)) this.#order(message.removeEmitter(id), { emitter: id });
       this.#played.delete(id);
       this.#dry.delete(id);
       this.#endWriter(id);
       this.#add(emitter);
+    } else if (this.#refused.has(id)) {
+      return; // it is asked for as it is then
     } else if (known.gainDb !== gainDb) {
       this.#order(message.setGain(emitter), { key: `gain ${id}`, emitter: id });
     } else {
@@ -132,10 +137,15 @@ export class Stream {
     }
   }
 
-  /** Lets the clip of an emitter fade out within `fadeS` seconds, from the clock `at` on or at once. */
+  /** Lets the clip of an emitter fade out within `fadeS` seconds, from the clock `at` on or at once. One that the server has refused is not
+      asked for again: it ends, removed. */
   stopEmitter({ id, at, fadeS }) {
     const emitter = this.#emitters.get(id);
     if (!emitter) return;
+    if (this.#refused.has(id)) {
+      this.#ended({ id, removed: true });
+      return;
+    }
     this.#emitters.set(id, { ...emitter, loop: false }); // what was stopped is not begun again by a new stream
     if (this.#isOpen) this.#order(message.stopEmitter({ id, stopAt: this.#serverClock(at), fadeS }), { emitter: id });
   }
@@ -213,7 +223,8 @@ export class Stream {
   }
 
   removeEmitter(id) {
-    if (this.#dropEmitter(id) && this.#isOpen) this.#order(message.removeEmitter(id), { emitter: id });
+    const isThere = !this.#refused.has(id);
+    if (this.#dropEmitter(id) && this.#isOpen && isThere) this.#order(message.removeEmitter(id), { emitter: id });
   }
 
   /** Forgets an emitter. Returns whether it was known. */
@@ -222,6 +233,7 @@ export class Stream {
     this.#endWriter(id);
     this.#dirty.delete(`emitter ${id}`);
     this.#missing.delete(id);
+    this.#refused.delete(id);
     this.#played.delete(id);
     return this.#emitters.delete(id);
   }
@@ -292,6 +304,7 @@ export class Stream {
   #add(emitter) {
     const { startAt, stopAt } = emitter;
     this.#missing.add(emitter.id);
+    this.#refused.delete(emitter.id);
     const clocks = { startAt: this.#serverClock(startAt), stopAt: this.#serverClock(stopAt) };
     this.#order(message.addEmitter({ ...emitter, ...clocks }), { emitter: emitter.id, adds: true });
   }
@@ -301,8 +314,12 @@ export class Stream {
   }
 
   #askAgain() {
-    for (const id of this.#missing) this.#add(this.#emitters.get(id));
+    this.#addRefused();
     for (const [id, { asked }] of this.#others) if (asked === null) this.#askFor(id);
+  }
+
+  #addRefused() {
+    for (const [id, mayBeAsked] of this.#refused) if (mayBeAsked) this.#add(this.#emitters.get(id));
   }
 
   #askFor(id) {
@@ -393,6 +410,7 @@ export class Stream {
     this.#orders = [];
     this.#ordered = 0;
     this.#missing.clear();
+    this.#refused.clear();
     this.#dry.clear();
     for (const other of this.#others.values()) other.number = other.asked = null;
   }
@@ -539,6 +557,9 @@ export class Stream {
         clearTimeout(this.#asking);
         this.#asking = setTimeout(() => this.#askAgain(), comeBackMs);
       }
+      const { emitter } = received;
+      // What is said about one that the server does not have is no answer to the question for it.
+      if (this.#missing.has(emitter) && received.code !== NO_EMITTER) this.#refused.set(emitter, comeBackMs !== null);
       if (received.listener) this.#refusedListener(received);
       else if (received.code === NOT_KNOWN) this.#refusedUnnamed(received);
       this.#listeners.refused(received);
@@ -552,6 +573,7 @@ export class Stream {
 
   #added(id, clock) {
     this.#missing.delete(id);
+    this.#refused.delete(id);
     if (!this.#emitters.has(id)) return;
     if (this.#isOver(id)) {
       // The server goes by a snapshot from before it was heard, and begins it again.
@@ -596,9 +618,9 @@ export class Stream {
     this.setListener({ ...this.#listener, at: now() });
     clearInterval(this.#heartbeat);
     this.#heartbeat = setInterval(() => {
-      if (now() - this.#sentAt < REST_MS) return;
-      for (const id of this.#others.keys()) this.moveListener({ id, at: now() });
-      this.setListener({ ...this.#listener, at: now() });
+      const rests = (id) => now() - this.#posedAt.get(id) > REST_MS / 2;
+      for (const id of this.#others.keys()) if (rests(id)) this.moveListener({ id, at: now() });
+      if (rests(null)) this.setListener({ ...this.#listener, at: now() });
     }, REST_MS);
   }
 
@@ -625,9 +647,11 @@ export class Stream {
       order.isSent = true;
       if (!order.adds || !this.#emitters.has(order.emitter)) continue;
       this.#missing.add(order.emitter); // though it may have been heard since the snapshot
+      this.#refused.delete(order.emitter);
       this.#played.delete(order.emitter);
       this.#dry.delete(order.emitter);
     }
+    this.#addRefused();
     for (const id of this.#emitters.keys()) this.#dirty.add(`emitter ${id}`);
     const numbers = new Map(listeners.map(({ id, index }) => [id, index]));
     for (const [id, other] of this.#others) {
@@ -685,7 +709,7 @@ export class Stream {
     if (!this.#welcomed) return;
     this.#sentAt = now();
     for (const { id, position, orientation, at } of this.#emitters.values()) {
-      if (!this.#dirty.has(`emitter ${id}`)) continue;
+      if (!this.#dirty.has(`emitter ${id}`) || this.#refused.has(id)) continue;
       this.#send(message.moveEmitter({ id, position, orientation, poseId: ++this.#poseId }));
       this.#listeners.posed({ poseId: this.#poseId, at });
     }
@@ -693,11 +717,13 @@ export class Stream {
       if (number === null || !this.#dirty.has(`listener ${id}`)) continue;
       this.#send(serializePose({ poseId: ++this.#poseId, number, ...pose }));
       this.#listeners.posed({ poseId: this.#poseId, at, listener: id });
+      this.#posedAt.set(id, this.#sentAt);
     }
     if (this.#dirty.has("listener")) {
       const { at, ...pose } = this.#listener;
       this.#send(serializePose({ poseId: ++this.#poseId, ...pose }));
       this.#listeners.posed({ poseId: this.#poseId, at });
+      this.#posedAt.set(null, this.#sentAt);
     }
     this.#dirty.clear();
   }
