@@ -78,14 +78,16 @@ def serving(
     costs_after_s: float = 3600.0,
     settings: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """A server of its own process, ready to stream; `settings` are environment variables.
+    """A server of its own process, ready to stream; `settings` are environment variables. Unless they say otherwise,
+    nobody is refused because other tests take the processor.
 
     Of the bundled scenes it has `scenes`, each of which takes a second to load and another to measure. What nothing
     waits for, as what effects cost, it measures `costs_after_s`: usually never.
     """
     program = _SERVE.format(scenes=scenes, costs_after_s=costs_after_s)
     command = [sys.executable, "-c", program, "serve", "--port", str(port), *options]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, **(settings or {})})
+    environment = {**os.environ, "NAFIR_ADMISSION": "false", **(settings or {})}
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
     url = f"http://127.0.0.1:{port}"
     try:
         deadline = time.monotonic() + 180  # the first time ever, everything is compiled
@@ -149,10 +151,24 @@ def passing_on(port: int, url: str) -> Iterator[str]:
             end.close()
 
 
+def launch(playwright):
+    """A browser whose pages wait for `WAIT_MS`, unless they say how long."""
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_ARGUMENTS)
+    new_context = browser.new_context
+
+    def new_patient_context(**options):
+        context = new_context(**options)
+        context.set_default_timeout(WAIT_MS)
+        return context
+
+    browser.new_context = new_patient_context
+    return browser
+
+
 @pytest.fixture(scope="module")
 def browser():
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_ARGUMENTS)
+        browser = launch(playwright)
         yield browser
         browser.close()
 
@@ -172,7 +188,6 @@ open field has a coarser one."""
 def open_page(context, url: str):
     """With coarse maps of loudness, and without ripples about sources."""
     page = context.new_page()
-    page.set_default_timeout(WAIT_MS)
     page.emulate_media(reduced_motion="reduce")
     page.add_init_script(_COARSE_MAPS)
     page.goto(url)
@@ -208,7 +223,7 @@ def one_page(browser, server):
 
 def start(page) -> None:
     page.click("#play")
-    page.wait_for_function("nafir.state().connection === 'live' && nafir.state().poses.heard >= 0", timeout=WAIT_MS)
+    page.wait_for_function("nafir.state().connection === 'live' && nafir.state().poses.heard >= 0")
 
 
 _CAPTURE = """seconds => nafir.capture(seconds).then(({ left, right }) => [left, right].map((ear) => {
@@ -221,7 +236,9 @@ _CAPTURE = """seconds => nafir.capture(seconds).then(({ left, right }) => [left,
 
 
 def listen(page, *, seconds: float = LISTENING_S) -> np.ndarray:
-    """(2, n): what is played in the seconds to come."""
+    """(2, n): what is played in the seconds after all that was posed so far is heard."""
+    posed = page.evaluate("nafir.state().poses.posed")
+    page.wait_for_function("posed => nafir.state().poses.answered >= posed", arg=posed)
     page.wait_for_timeout(1000 * seconds)
     ears = [np.frombuffer(base64.b64decode(ear), np.float32) for ear in page.evaluate(_CAPTURE, seconds)]
     return np.asarray(ears, np.float64)

@@ -128,9 +128,8 @@ def test_javascript(bundle, hrtfs, tmp_path):
                 break
             time.sleep(0.1)
         with visitor.sync_api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=visitor.CHROMIUM, args=visitor.CHROMIUM_ARGUMENTS)
-            page = browser.new_page()
-            page.set_default_timeout(visitor.WAIT_MS)
+            browser = visitor.launch(playwright)
+            page = browser.new_context().new_page()
             page.goto(f"{url}?server=http://{address}&scene=flat")
             page.click("#start")
             page.wait_for_function("window.example?.nafir.latency.direct")

@@ -180,7 +180,7 @@ def test_a_connection_that_is_made_again_has_its_listeners_where_they_are_by_the
     page.evaluate("second.position = [2.5, 2.0, 1.5]")
     page.evaluate("() => void nafir.addListener({ id: 'late' }).then((late) => (window.late = late))")
     with visitor.passing_on(port, server):
-        page.wait_for_function("window.late && nafir.state === 'live'", timeout=visitor.WAIT_MS)
+        page.wait_for_function("window.late && nafir.state === 'live'")
         page.evaluate("[window.first, window.nafir] = [nafir, second]")
         page.wait_for_timeout(1000)
         left, right = visitor.level_db(listen(page, 2.0))

@@ -42,7 +42,7 @@ def session(page) -> str:
 
 def resumed(page) -> dict:
     """What the next welcome says of a stream that goes on."""
-    page.wait_for_function("nafir.welcome.resumed && nafir.state === 'live'", timeout=visitor.WAIT_MS)
+    page.wait_for_function("nafir.welcome.resumed && nafir.state === 'live'")
     return page.evaluate("nafir.welcome.resumed")
 
 
@@ -134,7 +134,7 @@ def test_a_clip_that_plays_once_and_was_heard_is_not_played_by_another_server(br
           nafir.addEmitter({ ...shot, id: "later", startAt: nafir.sampleClock + 1e9 });
           talker.gainDb = -70;
         }""")
-        page.wait_for_function("ends.length >= 2", timeout=visitor.WAIT_MS)
+        page.wait_for_function("ends.length >= 2")
         before = visitor.level_db(listen(page)[0])
         told = page.evaluate("ends")
         assert sorted(each["id"] for each in told) == ["over", "stays"]

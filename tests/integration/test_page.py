@@ -196,7 +196,7 @@ def test_a_lost_connection_is_taken_up_again(browser, server):
     assert set(page.locator("#effects .reason").all_inner_texts()) == {"–"}
     assert "".join(page.locator("#effects .cost").all_inner_texts()) == ""
     with passing_on(port, server):
-        page.wait_for_function("nafir.state().connection === 'live'", timeout=visitor.WAIT_MS)
+        page.wait_for_function("nafir.state().connection === 'live'")
         page.evaluate("nafir.setListener({ yaw: 1 })")
         assert np.all(level_db(listen(page)) > -70)
         context.close()

@@ -36,7 +36,7 @@ def test_a_stream_goes_on_with_what_was_changed_meanwhile(browser):
         page.click("#add-source")
         assert page.evaluate("nafir.state().emitters.length") == 2
         with passing_on(port, server):
-            page.wait_for_function(IS_LIVE, timeout=visitor.WAIT_MS)
+            page.wait_for_function(IS_LIVE)
             assert resumptions(server, "resumed") == 1
             # The plan knows the source that came while there was no connection.
             page.wait_for_function("nafir.state().effects?.decisions.some(({ emitter }) => emitter === 'B')")
@@ -68,7 +68,7 @@ def test_a_stream_of_a_server_that_was_started_anew_goes_on_if_there_is_a_secret
     page.wait_for_function(IS_WAITING)
     page.click("#add-source")
     with serving(port, settings={**LONG, **secret}) as url:
-        page.wait_for_function(IS_LIVE, timeout=visitor.WAIT_MS)
+        page.wait_for_function(IS_LIVE)
         assert resumptions(url, outcome) == 1
         page.wait_for_function("nafir.state().effects?.decisions.some(({ emitter }) => emitter === 'B')")
         page.evaluate("nafir.setListener({ yaw: 1 })")

@@ -79,7 +79,7 @@ def test_a_part_that_fails_leaves_the_rest_as_it_is(context, server, part, answe
     assert page.locator("#scene-choice").is_visible()
     assert page.locator("#marks .listener").is_visible()
     page.click("#play")
-    page.wait_for_function("nafir.state().connection === 'live'", timeout=visitor.WAIT_MS)
+    page.wait_for_function("nafir.state().connection === 'live'")
     assert page.locator("#connection-text").inner_text() == "Live"
 
 
@@ -96,8 +96,8 @@ def test_clips_and_frontier_appear_once_the_server_answers(context, server):
     page = open_scene(context, server, SCENES[0])
     page.wait_for_function("document.getElementById('level-note').textContent.includes('not now')")
     failing["is"] = False
-    page.wait_for_function("nafir.state().emitters.length === 1", timeout=visitor.WAIT_MS)
-    page.wait_for_function("!document.getElementById('level-choice').disabled", timeout=visitor.WAIT_MS)
+    page.wait_for_function("nafir.state().emitters.length === 1")
+    page.wait_for_function("!document.getElementById('level-choice').disabled")
 
 
 def test_a_scene_that_cannot_be_had_leaves_the_menu_that_leads_out(context, server):

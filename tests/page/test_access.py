@@ -221,7 +221,7 @@ def test_everything_is_done_by_keyboard(browser, server):
 
     page.focus("#play")
     keys.press("Enter")
-    page.wait_for_function("nafir.state().connection === 'live'", timeout=visitor.WAIT_MS)
+    page.wait_for_function("nafir.state().connection === 'live'")
 
     page.focus("#add-source")
     keys.press("Space")

@@ -42,7 +42,6 @@ def visiting(browser, password):
         http_credentials=None if password is None else {"username": "me", "password": password},
     )
     page = context.new_page()
-    page.set_default_timeout(visitor.WAIT_MS)
     requested = []
     page.on("request", lambda request: requested.append(request.url))
     page.on("websocket", lambda socket: requested.append(socket.url))

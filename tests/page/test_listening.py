@@ -26,7 +26,6 @@ pytestmark = visitor.needs_browser
 PLACES = 6
 UNLIKE = 2
 """The place at which the planted preference is for the other method."""
-WAIT_MS = 120_000
 
 
 @contextlib.contextmanager
@@ -70,7 +69,6 @@ def visited(browser, url, **options):
     """The page; fails if an error was left in the console, but for a server that was not reached or did not know a
     code."""
     context = browser.new_context(viewport={"width": 1000, "height": 850}, **options)
-    context.set_default_timeout(WAIT_MS)
     complaints = []
     context.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     context.on("weberror", lambda error: complaints.append(str(error.error)))
