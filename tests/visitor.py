@@ -78,16 +78,14 @@ def serving(
     costs_after_s: float = 3600.0,
     settings: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """A server of its own process, ready to stream; `settings` are environment variables. Unless they say otherwise,
-    nobody is refused because other tests take the processor.
+    """A server of its own process, ready to stream; `settings` are environment variables.
 
     Of the bundled scenes it has `scenes`, each of which takes a second to load and another to measure. What nothing
     waits for, as what effects cost, it measures `costs_after_s`: usually never.
     """
     program = _SERVE.format(scenes=scenes, costs_after_s=costs_after_s)
     command = [sys.executable, "-c", program, "serve", "--port", str(port), *options]
-    environment = {**os.environ, "NAFIR_ADMISSION": "false", **(settings or {})}
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, **(settings or {})})
     url = f"http://127.0.0.1:{port}"
     try:
         deadline = time.monotonic() + 180  # the first time ever, everything is compiled

@@ -544,6 +544,7 @@ def test_a_full_server_says_so_and_has_room_again_when_someone_leaves(client_of_
 def test_a_hello_whose_turn_to_begin_does_not_come_is_told_when_to_come_back(client_of_few, monkeypatch):
     """While first responses of others wait for a worker, nobody else begins; its place is free again."""
     admission = client_of_few.app_state["host"].admission
+    monkeypatch.setattr(admission, "_is_on", True)
     monkeypatch.setattr(Workers, "has_urgent", property(lambda _: True))
     with client_of_few.websocket_connect("/v1/stream") as socket:
         socket.send_text(HELLO.serialize())

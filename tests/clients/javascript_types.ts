@@ -32,6 +32,7 @@ export async function listen(context: AudioContext): Promise<Latency | null> {
   const second: Listener = await nafir.addListener({ position: [3, 1, 1.6], yaw: 0.5, head: "kemar" });
   second.output.connect(context.destination);
   second.move({ position: [3, 2, 1.6] });
+  console.log(second.statistics.late + nafir.statistics.underruns);
   bind(nafir, new THREE.PerspectiveCamera(), second).update();
   nafir.addEventListener("left", ({ detail }) => console.warn(detail.id, detail.code));
   const spectator = await nafir.addListener().catch((error: RefusedError) => error.listener);

@@ -215,7 +215,7 @@ def test_a_real_server_is_heard(listen, served):
     _, _, line = readme_commands("unreal")
     host, port = served.split(":")
     given = line.replace("127.0.0.1", host).replace("8000", port).replace("apartment", "flat").split()[1:]
-    command = [listen, *given, "trumpet", "2"]
+    command = [listen, *given, "trumpet", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     lines = re.findall(r"left ([\d.]+)  right ([\d.]+)  pose (\d+)  Live", done.stdout)

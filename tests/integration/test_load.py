@@ -52,9 +52,8 @@ class Laborious:
 
 @pytest.fixture
 def served(serving, field, hrtfs):
-    with serving(
-        FieldsByLevel([Laborious(field, "fine", FINE_S), Laborious(field, "quick", QUICK_S)]), hrtfs
-    ) as address:
+    levels = FieldsByLevel([Laborious(field, "fine", FINE_S), Laborious(field, "quick", QUICK_S)])
+    with serving(levels, hrtfs, admission=True) as address:
         yield address
 
 

@@ -66,6 +66,18 @@ export interface Latency {
   outputMs: number;
 }
 
+export interface Statistics {
+  blocks: number;
+  /** Blocks that the server sent late. */
+  late: number;
+  /** Times that blocks were missing. */
+  gaps: number;
+  /** Times that no block was there to be played. */
+  underruns: number;
+  /** Times that the sound was stretched, so that one was. */
+  stretches: number;
+}
+
 export interface Directivity {
   pattern: "omnidirectional" | "subcardioid" | "cardioid" | "supercardioid" | "hypercardioid" | "figure_of_eight" | "measured";
   order?: number;
@@ -110,6 +122,8 @@ export interface Listener extends Placed {
   readonly output: AudioNode;
   /** From setting its pose to its sound, medians of the last seconds. */
   readonly latency: { direct: Latency | null; reverberation: Latency | null };
+  /** Counts since it was added. */
+  readonly statistics: Statistics;
   /** The last seconds that it heard, at most twelve. */
   capture(seconds: number): Promise<{ left: Float32Array; right: Float32Array }>;
   remove(): void;
@@ -190,6 +204,8 @@ export interface Nafir extends EventTarget {
   setEffects(effects: Record<string, boolean | null>): void;
   /** From setting a pose to its sound, medians of the last seconds. */
   readonly latency: { direct: Latency | null; reverberation: Latency | null };
+  /** Counts since the beginning. */
+  readonly statistics: Statistics;
   /** The last seconds that were heard, at most twelve. */
   capture(seconds: number): Promise<{ left: Float32Array; right: Float32Array }>;
   close(): void;

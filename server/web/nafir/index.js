@@ -46,15 +46,19 @@ function requireListener(id, { position, orientation, yaw = 0 }) {
   if (!Number.isFinite(yaw)) throw new RangeError(`yaw: has to be a number, not ${yaw}`);
 }
 
-/** What one listener hears: its Output, and how long poses take to be heard there. */
+/** What one listener hears: its Output, how long poses take to be heard there, and how many blocks were. */
 class Hearing {
   #direct = new PoseLedger();
   #reverberation = new PoseLedger();
   #steady = false;
+  #counters = { blocks: 0, late: 0, gaps: 0, underruns: 0, stretches: 0 };
 
   constructor(sound) {
     this.sound = sound;
-    sound.addEventListener("report", ({ detail }) => (this.#steady = detail.playing));
+    sound.addEventListener("report", ({ detail }) => {
+      this.#steady = detail.playing;
+      this.#counters = detail.counters;
+    });
     sound.addEventListener("heard", ({ detail }) => {
       this.#direct.heard(detail, this.#steady);
       this.#reverberation.heard({ ...detail, poseId: detail.reverberationPoseId }, this.#steady);
@@ -68,6 +72,11 @@ class Hearing {
 
   get latency() {
     return { direct: this.#direct.summary(), reverberation: this.#reverberation.summary() };
+  }
+
+  get statistics() {
+    const { blocks, late, gaps, underruns, stretches } = this.#counters;
+    return { blocks, late, gaps, underruns, stretches };
   }
 }
 
@@ -172,6 +181,11 @@ class Listener extends Placed {
   /** As that of the stream, of this listener's poses. */
   get latency() {
     return this.#hearing.latency;
+  }
+
+  /** Counts since this listener was added, as those of the stream. */
+  get statistics() {
+    return this.#hearing.statistics;
   }
 
   /** The last `seconds` that it heard, at most twelve: {left, right}. */
@@ -461,6 +475,12 @@ class Nafir extends EventTarget {
       serverMs, bufferMs, outputMs} or null if nothing was measured yet. */
   get latency() {
     return this.#hearing.latency;
+  }
+
+  /** Counts since the beginning: {blocks, late, gaps, underruns, stretches}: blocks that came, those that the server sent late, times that
+      some were missing, times that none was there to be played, and times that the sound was stretched so that one was. */
+  get statistics() {
+    return this.#hearing.statistics;
   }
 
   /** The last `seconds` that were heard, at most twelve: {left, right}. */

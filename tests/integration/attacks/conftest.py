@@ -41,7 +41,8 @@ def _serving(**environment: str) -> Iterator[tuple[str, int]]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-c", "from server.cli.main import main; main()", "serve", "--port", str(port)]
-    with subprocess.Popen(command, env={**os.environ, **environment}, stdout=subprocess.DEVNULL) as process:
+    environment = {**os.environ, "NAFIR_ADMISSION": "true", **environment}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
         try:
             _wait_until_ready(process, port)
             yield f"127.0.0.1:{port}", process.pid
