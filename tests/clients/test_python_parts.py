@@ -12,7 +12,7 @@ from nafir_client.ambisonics import Ears, harmonics, rotation
 from nafir_client.live_input import LiveInput
 from nafir_client.outbox import Outbox, Outgoing
 from nafir_client.pose import Pose
-from nafir_client.recording import Recording
+from nafir_client.recording import PathAsHeard, Recording
 from nafir_client.session import Session
 from nafir_client.stream_statistics import PoseWaits
 from nafir_client.wire import Block
@@ -133,8 +133,19 @@ def test_what_is_no_address_is_said(given):
         stream_url(given)
 
 
-def block(clock, value=1.0):
-    return Block(0, clock, 0, 0, np.full((256, 2), value, np.float32), False, False, False, 0.0)
+def block(clock, value=1.0, *, pose_id=0):
+    return Block(0, clock, pose_id, pose_id, np.full((256, 2), value, np.float32), False, False, False, 0.0)
+
+
+def test_of_a_packet_that_began_before_it_a_recording_has_the_rest_and_a_path_its_pose():
+    """Packets of Opus do not begin where an emitter does."""
+    recording, path = Recording(start_clock=300), PathAsHeard()
+    for number, clock in enumerate((0, 256, 512)):
+        path.note_pose(number, Pose.of((1.0, 2.0, number)))
+        path.note_block(block(clock, number, pose_id=number))
+        recording.add(block(clock, number))
+    np.testing.assert_array_equal(recording.samples()[:, 0], [1.0] * 212 + [2.0] * 256)
+    assert [(row[0], row[1], row[2]) for row in path.rows(300, "a")] == [(1, 300, 300), (2, 512, 512)]
 
 
 def test_a_recording_has_silence_for_blocks_that_were_skipped():

@@ -1,6 +1,7 @@
 """Streams on disk: the sound as it arrived, and the path as it was heard."""
 
 import csv
+import math
 from collections.abc import AsyncIterable, Callable, Mapping
 from pathlib import Path
 
@@ -29,16 +30,17 @@ def write_wav(path: Path | str, samples: Samples, sample_rate: int) -> None:
 
 
 class Recording:
-    """Blocks by their clock, with silence where blocks are missing. `start_clock` is the first sample to keep; blocks
-    that lie before it are not kept."""
+    """Blocks by their clock, with silence where blocks are missing. `start_clock` is the first sample to keep: of what
+    lies before it, nothing is kept."""
 
     def __init__(self, start_clock: int = 0) -> None:
         self.start_clock = start_clock
         self._blocks: dict[int, Samples] = {}
 
     def add(self, block: Block) -> None:
-        if block.sample_clock >= self.start_clock:
-            self._blocks[block.sample_clock] = block.samples
+        before = max(0, self.start_clock - block.sample_clock)
+        if before < len(block.samples):
+            self._blocks[block.sample_clock + before] = block.samples[before:]
 
     @property
     def frames(self) -> int:
@@ -116,9 +118,11 @@ class PathAsHeard:
         """
         direct: dict[int, int] = {}
         reverberation: dict[int, int] = {}
-        for clock, pose, reverberation_pose in self._heard:
-            if clock < start_clock:
+        followed = [*(following for following, _, _ in self._heard[1:]), math.inf]
+        for (began, pose, reverberation_pose), ended in zip(self._heard, followed, strict=True):
+            if ended <= start_clock:
                 continue
+            clock = max(began, start_clock)  # a packet of Opus may have begun before
             direct.setdefault(pose, clock)
             if reverberation_pose != next(reversed(reverberation.values()), None):
                 reverberation[clock] = reverberation_pose
