@@ -275,18 +275,23 @@ class _Life:
 
     def position_not_finite(self) -> list[str | bytes]:
         number = self._rng.choice((np.nan, np.inf, -np.inf))
-        return [_BINARY_POSE.pack(2, 0, 0, self._next_pose(), number, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0)]
+        return self._wrong_pose(_BINARY_POSE.pack(2, 0, 0, self._next_pose(), number, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
     def no_rotation(self) -> list[str | bytes]:
-        return [_BINARY_POSE.pack(2, 0, 0, self._next_pose(), *self._position, 0.0, 0.0, 0.0, 0.0)]
+        return self._wrong_pose(_BINARY_POSE.pack(2, 0, 0, self._next_pose(), *self._position, 0.0, 0.0, 0.0, 0.0))
 
     def far_away(self) -> list[str | bytes]:
         away = float(self._rng.choice((1e3, 1e6, 1e30)))
         pose_id = self._next_pose()
-        return [json.dumps({"type": "listener", "pose_id": pose_id, "position": [away, 1, 1], "yaw": 0})]
+        pose = {"type": "listener", "pose_id": pose_id, "position": [away, 1, 1], "yaw": 0}
+        return self._wrong_pose(json.dumps(pose))
 
     def stale_pose(self) -> list[str | bytes]:
-        return [ListenerPose(pose_id=0, position=_point(self._position), yaw=0.0).serialize()]
+        return self._wrong_pose(ListenerPose(pose_id=0, position=_point(self._position), yaw=0.0).serialize())
+
+    def _wrong_pose(self, pose: str | bytes) -> list[str | bytes]:
+        """With what keeps it from giving way, unanswered, to a newer pose where the server is busy."""
+        return [pose, *self.acknowledge_again()]
 
     def no_json(self) -> list[str | bytes]:
         return ["{" * int(self._rng.integers(1, 2_000))]
