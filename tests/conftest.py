@@ -196,8 +196,8 @@ def write_flat(folder: Path, manifest: Manifest) -> Bundle:
 
 @pytest.fixture(autouse=True, scope="session")
 def _settings_of_servers():
-    """Of those that tests begin, unless they say otherwise. They let in Starlette's test client, by its name, and
-    refuse nobody because other tests take the processor."""
+    """Servers that tests begin let in Starlette's test client, by its name, and refuse nobody because other tests take
+    the processor. A test may set otherwise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NAFIR_ALLOWED_HOSTS", "testserver")
         patch.setenv("NAFIR_ADMISSION", "false")

@@ -290,7 +290,7 @@ class _Life:
         return self._wrong_pose(ListenerPose(pose_id=0, position=_point(self._position), yaw=0.0).serialize())
 
     def _wrong_pose(self, pose: str | bytes) -> list[str | bytes]:
-        """With what keeps it from giving way, unanswered, to a newer pose where the server is busy."""
+        """With an acknowledgement after: of successive poses a busy server takes the newest, and answers no other."""
         return [pose, *self.acknowledge_again()]
 
     def no_json(self) -> list[str | bytes]:

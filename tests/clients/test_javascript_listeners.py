@@ -240,6 +240,14 @@ def test_an_emitter_that_a_full_server_refuses_is_asked_for_as_it_is_when_it_say
     assert (move.id, move.position[0]) == ("radio", 4.0)
 
 
+def test_an_error_about_something_else_loses_nothing_that_is_said_of_an_emitter(tmp_path):
+    waiting = [["emitter", radio(1)], ["receive", refused_emitter(code="malformed_message")]]
+    changed = [["emitter", radio(2)], ["emitter", radio(2, gain_db=-6.0)], ["pause", SETTLED_MS]]
+    *_, heard = run(tmp_path, OPENED, waiting, changed, [["receive", added()], ["pause", SETTLED_MS]])
+    assert [each.gain_db for each in of(SetGain, heard)] == [-6.0]
+    assert [each.position[0] for each in of(MoveEmitter, heard)] == [2.0]
+
+
 def test_a_refused_emitter_is_asked_for_again_by_a_stream_that_goes_on(tmp_path):
     refused = [["emitter", radio(1)], ["receive", refused_emitter(retry_after_s=20)]]
     lost = [["lose", 1006], ["emitter", radio(2)], ["reconnect", None], ["open", None]]

@@ -104,6 +104,8 @@ def test_an_emitter_is_heard_where_it_is(page):
     assert on_the_right[1] - on_the_right[0] > 1.5
     assert page.evaluate("nafir.welcome.sample_rate") == RATE
     assert page.evaluate("refusals") == []
+    # So many are in the four seconds of which the levels are.
+    assert page.evaluate("nafir.statistics.blocks * nafir.welcome.block_size") > 4 * RATE
 
     page.evaluate("radio.gainDb = -40")
     page.wait_for_timeout(1500)
@@ -184,6 +186,8 @@ def test_a_connection_that_is_made_again_has_its_listeners_where_they_are_by_the
         }""")
         page.wait_for_function("second.latency.direct !== null")
     page.wait_for_function("nafir.state === 'waiting'")
+    for whose in ("nafir", "second"):  # what there was left has been played
+        page.wait_for_function(f"{whose}.statistics.underruns > 0")
     page.evaluate("second.position = [2.5, 2.0, 1.5]")
     page.evaluate("() => void nafir.addListener({ id: 'late' }).then((late) => (window.late = late))")
     with visitor.passing_on(port, server):

@@ -30,8 +30,8 @@ def write_wav(path: Path | str, samples: Samples, sample_rate: int) -> None:
 
 
 class Recording:
-    """Blocks by their clock, with silence where blocks are missing. `start_clock` is the first sample to keep: of what
-    lies before it, nothing is kept."""
+    """Blocks by their clock, with silence where blocks are missing. `start_clock` is the first sample to keep;
+    what lies before it is left out."""
 
     def __init__(self, start_clock: int = 0) -> None:
         self.start_clock = start_clock

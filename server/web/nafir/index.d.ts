@@ -72,9 +72,9 @@ export interface Statistics {
   late: number;
   /** Times that blocks were missing. */
   gaps: number;
-  /** Times that no block was there to be played. */
+  /** Times that there was nothing left to play. */
   underruns: number;
-  /** Times that the sound was stretched, so that one was. */
+  /** Times that the sound was stretched until the next block came. */
   stretches: number;
 }
 

@@ -477,8 +477,8 @@ class Nafir extends EventTarget {
     return this.#hearing.latency;
   }
 
-  /** Counts since the beginning: {blocks, late, gaps, underruns, stretches}: blocks that came, those that the server sent late, times that
-      some were missing, times that none was there to be played, and times that the sound was stretched so that one was. */
+  /** Counts since the beginning, {blocks, late, gaps, underruns, stretches}: blocks that came; blocks that the server sent late; times that
+      blocks were missing; times that there was nothing left to play; and times that the sound was stretched until the next block came. */
   get statistics() {
     return this.#hearing.statistics;
   }

@@ -334,6 +334,7 @@ export class Stream {
     other?.opus?.close();
     clearTimeout(other?.limit);
     this.#dirty.delete(`listener ${id}`);
+    this.#posedAt.delete(id);
     return this.#others.delete(id);
   }
 
@@ -573,7 +574,7 @@ export class Stream {
 
   #added(id, clock) {
     this.#missing.delete(id);
-    this.#refused.delete(id);
+    const wasRefused = this.#refused.delete(id);
     if (!this.#emitters.has(id)) return;
     if (this.#isOver(id)) {
       // The server goes by a snapshot from before it was heard, and begins it again.
@@ -583,6 +584,14 @@ export class Stream {
     }
     this.#played.set(id, { start: clock + this.#clockOffset, wasHeard: false, hasEnded: false });
     if (this.#emitters.get(id).live) this.#dry.set(id, 0);
+    if (wasRefused) this.#tell(id); // an error was about something else, and nothing has been said since
+  }
+
+  /** Says how loud an emitter is by now, and where. */
+  #tell(id) {
+    this.#order(message.setGain(this.#emitters.get(id)), { key: `gain ${id}`, emitter: id });
+    this.#dirty.add(`emitter ${id}`);
+    this.#schedule();
   }
 
   #welcome(welcome) {
