@@ -44,6 +44,16 @@ def test_an_energy_that_cannot_be_is_told_with_its_pair(dataset, spoilt, take, v
             opened(folder)
 
 
+def test_energies_that_are_stored_otherwise_are_told(spoilt):
+    folder = spoilt("yaws", 0, 0)
+    with h5py.File(folder / "pairs.h5", "r+") as file:
+        energies = file["log_energy"][()]
+        del file["log_energy"]
+        file["log_energy"] = energies
+    with pytest.raises(DatasetError, match=r"log_energy: is not stored pair by pair; simulate"):
+        Dataset.open(folder)
+
+
 def test_no_energy_is_an_energy(dataset, spoilt):
     emitter, listener = pair_of(dataset, held_out=False)
     Dataset.open(spoilt("log_energy", (0, emitter, listener, 2, 3, 4), -np.inf))
