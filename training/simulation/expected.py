@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from server.acoustics.codec import Codec
 from server.rendering.hrtf import kemar
@@ -44,19 +45,19 @@ class ExpectedSpectrograms:
         return self._synthesis.arrival_products(self._codec.bins)
 
     @cached_property
-    def _times_s(self) -> _Floats:
-        """(frame, step) times on a grid that is much finer than the codec's window, so that it resolves changes within
-        the window."""
+    def _windows(self) -> tuple[_Floats, csr_array]:
+        """(time,) times on a grid that is much finer than the codec's window, so that it resolves changes within the
+        window, and (time, frame) the window of each frame on it. Frames that overlap share times."""
         codec = self._codec
         step = codec.hop // _STEPS_PER_HOP
         around = np.arange(-codec.n_fft // 2, codec.n_fft // 2, step) + step / 2
-        return np.asarray(codec.frame_times_s[:, None] + around / codec.sample_rate)
-
-    @cached_property
-    def _window(self) -> _Singles:
-        """(step,) the codec's window on the grid of `_times_s`."""
-        window = np.hanning(self._times_s.shape[1] + 2)[1:-1] ** 2
-        return np.asarray(self._codec.window_energy * window / window.sum(), dtype=np.float32)
+        window = np.hanning(len(around) + 2)[1:-1] ** 2
+        samples = np.rint(codec.frame_times_s * codec.sample_rate)[:, None] + around
+        at, time = np.unique(samples, return_inverse=True)
+        of_all = np.broadcast_to(codec.window_energy * window / window.sum(), samples.shape)
+        frame = np.repeat(np.arange(codec.frames), len(around))
+        windows = csr_array((of_all.ravel(), (time.ravel(), frame)), (len(at), codec.frames))
+        return at / codec.sample_rate, windows
 
     def specular(self, emitter: int, listener: int) -> _Singles:
         """(yaw, ear, sample) the specular part of the late reverberation, which is the same in every draw."""
@@ -95,6 +96,6 @@ class ExpectedSpectrograms:
     ) -> tuple[_Singles, float, _Floats, _Singles]:
         """Energies, onset, and the times and weights with which the frames of a codec sum them to cells."""
         (energy,) = self._dataset.read_energy(np.array([[emitter, listener]]))
-        times_s = (self._times_s + advance_samples / self._codec.sample_rate).ravel()
-        weights = (pool[:, None, :] * self._window[:, None]).reshape(len(times_s), -1)
-        return energy, float(self._dataset.onset_s[emitter, listener]), times_s, weights
+        times_s, windows = self._windows
+        advanced_s = times_s + advance_samples / self._codec.sample_rate
+        return energy, float(self._dataset.onset_s[emitter, listener]), advanced_s, windows @ pool
