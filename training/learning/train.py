@@ -147,7 +147,7 @@ class _Loop:
         self._optimiser = torch.optim.AdamW(learner.parameter_groups(), configuration.learning_rate, fused=True)
         visited = len(self._order(0))
         # A small scene has fewer rows than a batch; processes have equal shares of a batch.
-        size = min(configuration.batch, visited)
+        size = min(configuration.examples_of_a_step(visited), visited)
         self._batch = max(size - size % processes.count, processes.count)
         self._steps_per_epoch = max(1, visited // self._batch)
         # guard: a run goes on from its checkpoint and not from its beginning

@@ -210,6 +210,15 @@ def test_targets_are_of_the_codec_of_the_data(dataset):
     assert Cells(codec).fine_frames < codec.frames
 
 
+@pytest.mark.parametrize(("examples", "batch"), [(100, 32), (12_800, 32), (12_801, 64), (30_000, 96)])
+def test_an_epoch_of_many_pairs_has_larger_steps_and_not_more(examples, batch):
+    assert configure("directional").examples_of_a_step(examples) == batch
+
+
+def test_the_papers_network_has_the_papers_batch_however_many_responses_there_are():
+    assert configure("naf").examples_of_a_step(1_000_000) == 20
+
+
 @pytest.fixture
 def naf_configuration():
     return Configuration.naf(
