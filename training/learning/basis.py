@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from training.data.responses import ResponseSet
-from training.learning.learner import Losses, Rows
+from training.learning.learner import Rows
 from training.learning.schedule import one_cycle
 from training.models.basis_field import BasisField
 from training.models.cells import Cells
@@ -129,18 +129,18 @@ class BasisLearner(ABC):
         """(row, heads.size) flat targets."""
         return torch.from_numpy(self.targets.flat[rows]).float()
 
-    def _head_losses(self, prediction: Tensor, flat: Tensor, counted: Mapping[str, Tensor]) -> Losses:
-        """The weighted mean squared error of each head, for normalised predictions of targets in physical units. Heads
-        in `counted` count only the rows (B,) that it marks."""
+    def _head_errors(self, prediction: Tensor, flat: Tensor, counted: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The weighted mean squared errors (B,) of each head, for normalised predictions of targets in physical units.
+        Heads in `counted` count only the rows (B,) that it marks."""
         field = self.field
         off = prediction - (flat - field.mean) / field.spread
         squared = off * off  # its gradient is faster than that of a power
-        losses = {}
+        errors = {}
         # Split in place of slicing, because the gradient of each slice would be as wide as the whole.
         for name, part in zip(field.heads.shapes, squared.split(field.heads.sizes, dim=1), strict=True):
             of_rows = part.mean(dim=1)
-            losses[name] = self._weights[name] * (of_rows * counted[name] if name in counted else of_rows).mean()
-        return losses
+            errors[name] = self._weights[name] * (of_rows * counted[name] if name in counted else of_rows)
+        return errors
 
     def _levels_of(self, prediction: Tensor) -> Tensor:
         """Predicted levels in physical units."""

@@ -30,6 +30,8 @@ _EXCHANGED_SHARE = 0.5
 _FIT_STEPS, _FIT_RATE = 400, 0.05
 _FIT_OUTLIER = 0.5
 """Nepers beyond which a level counts in proportion, and not by its square."""
+_LEAST_ERROR = 0.05
+"""What is added to the errors of pairs, so that none of them counts for all others."""
 _HEAD_WEIGHTS = {LOG_MAGNITUDE: 1.0, DIRECTIONS: 1.0}
 
 
@@ -106,10 +108,14 @@ class DirectionalLearner(BasisLearner):
         return tuple(map(torch.from_numpy, poses)), (self._flat(rows), knows_directions)
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
+        """Means over pairs, which count alike in validation, and as `_shares` says in training."""
         flat, knows_directions = targets
-        losses = self._head_losses(prediction, flat, {DIRECTIONS: knows_directions})
+        errors = self._head_errors(prediction, flat, {DIRECTIONS: knows_directions})
         error = self._energy_error.to(flat.device)(self._levels_of(prediction), flat[:, self.field.heads.levels])
-        return {**losses, "energy": self.recipe.energy_weight * error}
+        errors["energy"] = self.recipe.energy_weight * error
+        whole = torch.stack(list(errors.values())).sum(dim=0)
+        shares = _shares(whole.detach() if self.field.training else torch.ones_like(whole))
+        return {name: shares @ of_pairs for name, of_pairs in errors.items()}
 
     def _losses_between(self, rows: Rows) -> Tensor:
         """What these pairs say of it, whichever rooms are louder or quieter with all doors open."""
@@ -133,6 +139,16 @@ class DirectionalLearner(BasisLearner):
     def _one_of_each_pair(self, rows: Rows) -> Rows:
         _, first = np.unique(self._pair[rows], return_index=True)
         return rows[np.sort(first)]
+
+
+def _shares(errors: Tensor) -> Tensor:
+    """(B,) how much each pair counts, whose `errors` (B,) are these; 1 in all.
+
+    Chance decides more about pairs that few rays join than about those in sight, which would then hardly count. So each
+    pair is taken to have a variance of its own, which its error tells: the gradient is that of the mean logarithm of
+    errors, and so of the likelihood with the most likely variances."""
+    weights = 1 / (errors + _LEAST_ERROR)
+    return weights / weights.sum()
 
 
 @torch.enable_grad()

@@ -36,9 +36,10 @@ class _ErrorOfSums(nn.Module, ABC):
         self._fine_frames, self._deficit = fine_frames // _RUN * _RUN, deficit
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """The error of flat levels (B, size of `heads.levels`) in physical units."""
+        """(B,) the errors of flat levels (B, size of `heads.levels`) in physical units."""
         ours, theirs = self._energies(predicted, self._deficit), self._energies(target, 0.0)
-        return torch.stack([nn.functional.mse_loss(a, b) for a, b in zip(ours, theirs, strict=True)]).sum()
+        squared = [(a - b).square().flatten(1).mean(dim=1) for a, b in zip(ours, theirs, strict=True)]
+        return torch.stack(squared).sum(dim=0)
 
     def _energies(self, flat: Tensor, deficit: float) -> list[Tensor]:
         """Half the logarithms of three kinds of energy: the energy still to come by octave, the same summed over

@@ -99,11 +99,11 @@ class FactorisedLearner(BasisLearner):
         flat, measured = targets[0].float(), targets[1]
         # Distillation targets have valid levels only.
         others = [name for name in self.field.heads.shapes if name not in _LEVEL_HEADS]
-        losses = self._head_losses(prediction, flat, dict.fromkeys(others, measured))
+        errors = self._head_errors(prediction, flat, dict.fromkeys(others, measured))
         if self.recipe.energy_weight:
             error = self._energy_error.to(flat.device)(self._levels_of(prediction), flat[:, self.field.heads.levels])
-            losses["energy"] = self.recipe.energy_weight * error
-        return losses
+            errors["energy"] = self.recipe.energy_weight * error
+        return {name: of_rows.mean() for name, of_rows in errors.items()}
 
     def _distill(self, run: Path) -> DistillationTargets:
         """Return the distillation targets of a finished `naf` run. Raises RunError if the folder holds no finished run

@@ -144,6 +144,37 @@ def test_bands_have_the_levels_of_the_training_pairs_on_average(dataset, learned
     assert (10 * torch.log10((found @ widths) / (true @ widths))).mean(dim=0).abs().max() < 0.01
 
 
+def test_pairs_that_nobody_can_predict_count_little_in_training_and_like_others_in_validation(dataset, directional):
+    """The gradient is that of the mean logarithm of the pairs' errors."""
+    learner = DirectionalLearner(SimulatedResponses(dataset), directional)
+    learner.prepare(SILENT)
+    learner.initialise(np.arange(8 * len(dataset.yaws)), 0)
+    rows = len(dataset.yaws) * np.arange(8)
+    inputs, (flat, known) = learner.batch(rows, None)
+    flat = flat + torch.linspace(0, 3, 8)[:, None] * torch.randn(flat.shape, generator=torch.Generator().manual_seed(0))
+
+    def of_pairs(prediction):
+        learner.field.eval()
+        each = [
+            learner.losses(prediction[at : at + 1], (flat[at : at + 1], known[at : at + 1])) for at in range(len(rows))
+        ]
+        return torch.stack([torch.stack(list(losses.values())).sum() for losses in each])
+
+    def gradient(loss):
+        (found,) = torch.autograd.grad(loss(prediction := learner.field(*inputs)), prediction)
+        return found / found.norm()
+
+    def whole(prediction, *, training):
+        learner.field.train(training)
+        return torch.stack(list(learner.losses(prediction, (flat, known)).values())).sum()
+
+    expected = gradient(lambda prediction: torch.log(of_pairs(prediction) + 0.05).mean())
+    torch.testing.assert_close(gradient(lambda prediction: whole(prediction, training=True)), expected)
+    plain = gradient(lambda prediction: of_pairs(prediction).mean())
+    torch.testing.assert_close(gradient(lambda prediction: whole(prediction, training=False)), plain)
+    assert (plain - expected).norm() > 0.3
+
+
 def test_an_interrupted_run_goes_on_to_the_same_field(dataset, directional, tmp_path, monkeypatch):
     responses = SimulatedResponses(dataset)
     short = dataclasses.replace(directional, epochs=3, recipe=DirectionalRecipe(order=1, noise_m=0.1))
