@@ -34,6 +34,7 @@ _OPTIONS = {
     "merge_within_m": "--merge-within-m",
     "sample_rate": "--sample-rate",
     "rays": "--rays",
+    "probes": "--probes",
     "seed": "--seed",
 }
 _LENGTHS = {"epochs": "--epochs", "minutes": "--minutes", "seed": "--seed"}

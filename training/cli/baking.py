@@ -17,6 +17,7 @@ from training.cli.importing_levels import (
     MaterialsFile,
     MergeWithin,
     OpenSky,
+    ProbeCount,
     Rays,
     SampleRate,
     SceneName,
@@ -24,10 +25,13 @@ from training.cli.importing_levels import (
     UpOption,
     write_scene,
 )
-from training.cli.learning import Epochs, Minutes, train_into
+from training.cli.learning import Minutes, train_into
 from training.cli.options import Folder, Seed
 from training.cli.simulating import Workers, simulate_into
-from training.data.levels.import_options import MERGE_WITHIN_M, RAYS, SAMPLE_RATE_HZ
+from training.data.levels.import_options import MERGE_WITHIN_M, PROBES, RAYS, SAMPLE_RATE_HZ
+
+EPOCHS = 40
+"""Of training. Levels have ten times as many pairs as a room of a hundred epochs."""
 
 
 def bake(
@@ -43,7 +47,10 @@ def bake(
     merge_within_m: MergeWithin = MERGE_WITHIN_M,
     sample_rate: SampleRate = SAMPLE_RATE_HZ,
     rays: Rays = RAYS,
-    epochs: Epochs = None,
+    probes: ProbeCount = PROBES,
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help=f"Passes over the training set; {EPOCHS} if not given.")
+    ] = None,
     minutes: Minutes = None,
     seed: Seed = 0,
     workers: Workers = 0,
@@ -74,10 +81,10 @@ def bake(
         merge_within_m,
         sample_rate,
         rays,
+        probes,
         seed,
     )
-    given: dict[str, Any] = {"epochs": epochs, "minutes": minutes}
-    length = {name: value for name, value in given.items() if value is not None}
+    length: dict[str, Any] = {"epochs": epochs or EPOCHS} if minutes is None else {"minutes": minutes}
     configuration = configure("directional", seed=seed, **length)
     baked = Bake(output, level, choices, configuration)
     imported, data, run, bundle = map(baked.path, Stage)

@@ -12,8 +12,8 @@ from server.core.command_line import writable_folder
 from server.core.files import require_matplotlib
 from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from training.cli.options import Json, Seed
-from training.data.levels.import_options import MERGE_WITHIN_M, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
-from training.data.limits import FEWEST_RAYS, MOST_RAYS
+from training.data.levels.import_options import MERGE_WITHIN_M, PROBES, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
+from training.data.limits import FEWEST_PROBES, FEWEST_RAYS, MOST_PROBES, MOST_RAYS
 
 if TYPE_CHECKING:
     from training.data.levels.level_import import Choices
@@ -59,6 +59,11 @@ Rays = Annotated[
     typer.Option("--rays", min=FEWEST_RAYS, max=MOST_RAYS, help="Of each emitter in the simulation."),
 ]
 
+ProbeCount = Annotated[
+    int,
+    typer.Option("--probes", min=FEWEST_PROBES, max=MOST_PROBES, help="About how many places to simulate."),
+]
+
 
 def import_level(
     level: LevelPath,
@@ -73,6 +78,7 @@ def import_level(
     merge_within_m: MergeWithin = MERGE_WITHIN_M,
     sample_rate: SampleRate = SAMPLE_RATE_HZ,
     rays: Rays = RAYS,
+    probes: ProbeCount = PROBES,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -91,6 +97,7 @@ def import_level(
         merge_within_m,
         sample_rate,
         rays,
+        probes,
         seed,
     )
     write_scene(level, choices, output, as_json=as_json)

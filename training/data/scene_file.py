@@ -23,16 +23,13 @@ from server.scene.effects import EffectName
 from server.scene.geometry import Geometry, Strict
 from server.scene.limits import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, MOST_SAMPLES
 from server.scene.manifest import Air, Start
-from training.data.limits import FEWEST_LISTENERS, FEWEST_RAYS, MOST_RAYS
+from training.data.limits import FEWEST_LISTENERS, FEWEST_PROBES, FEWEST_RAYS, MOST_RAYS
 from training.data.scene_openings import faults_of
 from training.data.simulation_plan import SimulatedEffect
 
 HISTOGRAM_BIN_S = 0.004
 
 _DRAWS_PER_CELL = 32
-# At least one couple of probes is held out, and two probes make only one couple.
-FEWEST_PROBES = 3
-
 MOST_CELLS = 100_000
 """The most cells of the grids around a place, many of which may lie outside the walls."""
 CELLS_PER_BATCH = 256

@@ -8,10 +8,9 @@ from functools import cached_property
 from server.acoustics.bands import OCTAVE_BANDS_HZ
 from training.data.dataset import SPEED_OF_SOUND
 from training.data.levels.level_scene import LevelScene
+from training.data.limits import MOST_PROBES
 from training.data.scene_file import MOST_CELLS, SceneFile, SceneFileError, Simulation
 
-MOST_PROBES = 2_000
-"""The most probes. If each is heard from every other, these are four million pairs."""
 MOST_DATASET_GB = 200.0
 MOST_MEMORY_GB = 8.0
 """The most memory for one emitter; each worker simulates one at a time."""

@@ -14,7 +14,7 @@ from training.data.levels import level_import
 from training.data.levels.gltf_writer import Piece, WrittenNode, write_glb
 from training.learning import train as training
 
-BRIEF = {"--rays": "100", "--sample-rate": "8000", "--workers": "1", "--epochs": "1"}
+BRIEF = {"--rays": "100", "--probes": "6", "--sample-rate": "8000", "--workers": "1", "--epochs": "1"}
 
 
 def write_level(path, *, material="curtain", length_m=3.0):

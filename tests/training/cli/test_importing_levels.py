@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from tests.training.data.levels.conftest import room
+from tests.training.data.levels.conftest import box, room
 from training.cli.main import main
-from training.data.levels.gltf_writer import write_glb
+from training.data.levels.gltf_writer import Piece, WrittenNode, write_glb
 from training.data.levels.level_scene import LevelScene
 
 
@@ -44,6 +44,21 @@ def test_the_scene_is_simulated_at_the_rate_and_with_the_rays_that_are_asked_for
     assert (simulation.sample_rate, simulation.rays) == (rate, 5000)
 
 
+@pytest.mark.parametrize(("side_m", "wanted"), [(30.0, 60), (30.0, 240), (90.0, 120)])
+def test_about_as_many_probes_stand_in_a_level_of_any_size_as_are_asked_for(nafir_train, tmp_path, side_m, wanted):
+    write_glb(tmp_path / "level.glb", [WrittenNode("room", (Piece(*box(high=(side_m, 3.0, side_m)), "plaster"),))])
+    code, _, _ = nafir_train(tmp_path / "level.glb", "-o", tmp_path, "--probes", str(wanted))
+    assert code == 0
+    assert 0.75 * wanted < len(LevelScene.read(tmp_path).probe_positions(0)) < 1.4 * wanted
+
+
+def test_in_a_small_room_probes_stand_no_nearer_than_is_of_use(nafir_train, tmp_path):
+    write_glb(tmp_path / "level.glb", [room()])
+    code, _, _ = nafir_train(tmp_path / "level.glb", "-o", tmp_path, "--probes", "2000")
+    assert code == 0
+    assert LevelScene.read(tmp_path).file.probes.spacing_m == 0.5
+
+
 def test_a_refused_level_is_one_line_and_the_json_says_why(nafir_train, tmp_path):
     write_glb(tmp_path / "level.glb", [room("M_042", without=(4, 10))])
     code, out, err = nafir_train(tmp_path / "level.glb", "-o", tmp_path / "scene", "--json")
@@ -62,6 +77,7 @@ def test_a_refused_level_is_one_line_and_the_json_says_why(nafir_train, tmp_path
         (["level.glb", "--merge-within-m", "1"], "--merge-within-m"),
         (["level.glb", "--sample-rate", "4000"], "--sample-rate"),
         (["level.glb", "--rays", "10"], "--rays"),
+        (["level.glb", "--probes", "2"], "--probes"),
         (["level.glb", "--default-material", "brik"], "near: brick"),
         (["level.glb", "--materials", "missing.toml"], "cannot be read"),
         (["level.glb", "--scene", "9"], "--scene: '9' is no scene"),

@@ -5,8 +5,11 @@ from enum import StrEnum
 
 MERGE_WITHIN_M = 0.005
 """How far merging may move a surface: an eighth of the wavelength at 8 kHz."""
-SAMPLE_RATE_HZ, RAYS = 24_000, 20_000
-"""Of the simulation."""
+SAMPLE_RATE_HZ, RAYS = 24_000, 15_000
+"""Of the simulation. Rays are few because places are many: a field evens out what each emitter's rays get wrong."""
+PROBES = 200
+"""About how many places are simulated. The doors stand otherwise for each, and a field learns what happens between
+places and between states of doors from neighbours."""
 
 
 class Units(StrEnum):

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from server.scene.geometry import Material
 from server.scene.manifest import Start
 from training.data.levels.examination import Examination, examine
 from training.data.levels.gltf_file import read_gltf
-from training.data.levels.import_options import MERGE_WITHIN_M, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
+from training.data.levels.import_options import MERGE_WITHIN_M, PROBES, RAYS, SAMPLE_RATE_HZ, Handedness, Units, Up
 from training.data.levels.level import GLTF_AXES, Axes, Level, level_of
 from training.data.levels.level_scene import (
     MESH_FILE,
@@ -44,6 +44,11 @@ _SHORTEST_S, _LONGEST_S = 0.3, 8.0
 _EYRING = 0.161
 _MOST_POINTS = 500_000
 """Points of space among which the start is looked for."""
+_JITTER, _NEAREST_M, _CLEAR_SHARE = 0.28, 0.5, 0.8
+"""Probes are moved from the middle of their cells by at most so much of a cell's side, are at least so far apart, and
+stand in about so many of the cells that have ground: in the others there is no room for one."""
+_PROBES = Probes(spacing_m=1.0, jitter_m=_JITTER, wall_clearance_m=0.4, heights_m=(1.2, 1.9))
+_LISTENERS = 110
 _ARRIVAL_DIRECTIONS = 48
 """With few directions, the waves that arrive from them interfere at the ears, and IACC comes out too large: that of
 diffuse sound (T60 0.5 s, 48 kHz) is 0.128 with 24 directions, 0.104 with 48 and 0.099 with 240."""
@@ -63,6 +68,7 @@ class Choices:
     merge_within_m: float = MERGE_WITHIN_M
     sample_rate: int = SAMPLE_RATE_HZ
     rays: int = RAYS
+    probes: int = PROBES
     seed: int = 0
 
 
@@ -131,7 +137,8 @@ def import_level(path: Path, choices: Choices) -> ImportedLevel:
         return ImportedLevel(report, None, {}, places)
     materials = {each.name: each.material for each in assignments if each.material is not None and each.name in used}
     file = _file(path, level, seen, materials, start, choices)
-    return ImportedLevel(report, LevelScene(file, seen.mesh, seen.doors), _comments(report.assignments), places)
+    scene = _with_spaced_probes(LevelScene(file, seen.mesh, seen.doors), choices.probes)
+    return ImportedLevel(report, scene, _comments(report.assignments), places)
 
 
 def write_level(imported: ImportedLevel, folder: Path) -> None:
@@ -277,7 +284,7 @@ def _file(
             ),
         ),
         start=start,
-        probes=Probes(spacing_m=1.0, jitter_m=0.2, wall_clearance_m=0.4, heights_m=(1.2, 1.9)),
+        probes=_PROBES,
         simulation=Simulation(
             sample_rate=choices.sample_rate,
             duration_s=_duration_s(seen, materials),
@@ -285,9 +292,20 @@ def _file(
             rays=choices.rays,
             image_order=3,
             arrival_directions=_ARRIVAL_DIRECTIONS,
+            listeners=_LISTENERS,
             held_out_share=0.1,
         ),
     )
+
+
+def _with_spaced_probes(scene: LevelScene, wanted: int) -> LevelScene:
+    """The level with probes so far apart that about so many stand on the ground that is reached; no nearer than
+    _NEAREST_M."""
+    ground = scene.ground
+    area_m2 = len(ground.spots) * ground.step_m**2
+    spacing_m = max(_NEAREST_M, round(math.sqrt(_CLEAR_SHARE * area_m2 / wanted), 2))
+    probes = scene.file.probes.model_copy(update={"spacing_m": spacing_m, "jitter_m": round(_JITTER * spacing_m, 3)})
+    return replace(scene, file=scene.file.model_copy(update={"probes": probes}))
 
 
 def _duration_s(seen: Examination, materials: Mapping[str, Material]) -> float:

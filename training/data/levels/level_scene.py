@@ -29,7 +29,8 @@ from server.scene.manifest import Air, Start
 from server.scene.mesh_geometry import MeshGeometry
 from training.data.levels.probe_places import probe_places, require_few_cells
 from training.data.levels.walkable import Ground, reached_ground
-from training.data.scene_file import FEWEST_PROBES, NamedEffects, Probes, SceneFile, SceneFileError, Simulation
+from training.data.limits import FEWEST_PROBES
+from training.data.scene_file import NamedEffects, Probes, SceneFile, SceneFileError, Simulation
 
 SCENE_FILE, MESH_FILE = "scene.toml", "geometry.npz"
 _SPEED_OF_SOUND = 343.0
