@@ -61,7 +61,8 @@ class Learner(Protocol):
         ...
 
     def losses(self, prediction: Tensor, targets: tuple[Tensor, ...]) -> Losses:
-        """Return weighted terms of the loss: means over the batch, float32."""
+        """Return weighted terms of the loss: means over the batch, float32. While the field is trained, examples need
+        not count alike in these means; in validation they do."""
         ...
 
     def finish(self, rows: Rows) -> None:

@@ -54,7 +54,8 @@ class ExpectedSpectrograms:
         window = np.hanning(len(around) + 2)[1:-1] ** 2
         samples = np.rint(codec.frame_times_s * codec.sample_rate)[:, None] + around
         at, time = np.unique(samples, return_inverse=True)
-        of_all = np.broadcast_to(codec.window_energy * window / window.sum(), samples.shape)
+        scaled = (codec.window_energy * window / window.sum()).astype(np.float32)
+        of_all = np.broadcast_to(scaled, samples.shape)
         frame = np.repeat(np.arange(codec.frames), len(around))
         windows = csr_array((of_all.ravel(), (time.ravel(), frame)), (len(at), codec.frames))
         return at / codec.sample_rate, windows

@@ -49,6 +49,7 @@ _JITTER, _NEAREST_M, _CLEAR_SHARE = 0.28, 0.5, 0.8
 stand in about so many of the cells that have ground: in the others there is no room for one."""
 _PROBES = Probes(spacing_m=1.0, jitter_m=_JITTER, wall_clearance_m=0.4, heights_m=(1.2, 1.9))
 _LISTENERS = 110
+"""Of each emitter: half of the usual number of places, so that more emitters take no more room and time."""
 _ARRIVAL_DIRECTIONS = 48
 """With few directions, the waves that arrive from them interfere at the ears, and IACC comes out too large: that of
 diffuse sound (T60 0.5 s, 48 kHz) is 0.128 with 24 directions, 0.104 with 48 and 0.099 with 240."""
